@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -301,11 +301,28 @@ class Gap:
         return ": ".join([text, ", ".join(parts)] if parts else [text])
 
 
+Event: TypeAlias = Scan | Snapshot | SmoothedRun | RadarImage | LogLine
+"""What a run produces."""
+
+METHODS = {
+    Scan: "on_scan",
+    Snapshot: "on_snapshot",
+    SmoothedRun: "on_smoothed",
+    RadarImage: "on_image",
+    LogLine: "on_log",
+}
+"""Of an observer, by the type of event that they get."""
+
+
 class SessionObserver:
     """Gets everything a run produces, in order: a log, a viewer, a progress line.
 
-    Subclasses define the methods they need.
+    Subclasses define the methods they need; those that pass all events on override `take`.
     """
+
+    def take(self, event: Event) -> None:
+        """Get an event, by the method for its type."""
+        getattr(self, METHODS[type(event)])(event)
 
     def on_scan(self, scan: Scan) -> None: ...
 
@@ -335,25 +352,3 @@ class SessionObserver:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-class PassingObserver(SessionObserver):
-    """Passes every event on to `give`, with the name of the method that got it."""
-
-    def on_scan(self, scan: Scan) -> None:
-        self.give("on_scan", scan)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        self.give("on_snapshot", snapshot)
-
-    def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self.give("on_smoothed", smoothed)
-
-    def on_image(self, image: RadarImage) -> None:
-        self.give("on_image", image)
-
-    def on_log(self, line: LogLine) -> None:
-        self.give("on_log", line)
-
-    def give(self, method: str, event: object) -> None:
-        raise NotImplementedError

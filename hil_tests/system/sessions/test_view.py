@@ -164,7 +164,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
         for number, scan in enumerate(session.scans()):
             if number == 20:
                 kill_viewer()
-            watcher.on_scan(scan)
+            watcher.take(scan)
         watcher.close()
     said = capsys.readouterr().err
     assert said.count("the viewer was closed; the run goes on without it") == 1

@@ -17,7 +17,7 @@ from uuid import uuid4
 from slam.app.errors import UsageError
 from slam.app.publish import SINKS
 from slam.live.errors import AppError
-from slam.live.session_records import PassingObserver, SessionInfo, SessionObserver
+from slam.live.session_records import METHODS, Event, SessionInfo, SessionObserver
 from xethru_protocol.validation import choices, shown
 
 MOST_EVENTS = 256
@@ -89,7 +89,7 @@ class QueuedSink:
         self.n_put = self.n_sent = self.n_failed = 0
         self.warnings: list[str] = []
         self._warned: set[str] = set()
-        self._waiting: deque[tuple[str, object]] = deque(maxlen=MOST_EVENTS)
+        self._waiting: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._changed = threading.Condition()
         self._is_over = False
         self._thread: threading.Thread | None = None
@@ -108,15 +108,16 @@ class QueuedSink:
         )
         self._thread.start()
 
-    def put(self, method: str, event: object) -> None:
-        """Queue an event for a method of the sink; the oldest one goes if there is no room."""
+    def put(self, event: Event) -> None:
+        """Queue an event for the sink; the oldest one goes if there is no room."""
+        method = METHODS[type(event)]
         if getattr(type(self._sink), method) is getattr(Sink, method):
             return
         with self._changed:
             self.n_put += 1
             if len(self._waiting) == MOST_EVENTS:
                 self._warn("dropped", "is too slow, so its oldest events are dropped")
-            self._waiting.append((method, event))
+            self._waiting.append(event)
             self._changed.notify()
 
     def end(self) -> None:
@@ -138,13 +139,12 @@ class QueuedSink:
     def _run(self, info: SessionInfo, start_ns: int, map_id: str) -> None:
         has_begun = self._try(self._sink.begin, info, start_ns, map_id)
         while (event := self._next()) is not None:
-            method, what = event
-            is_sent = has_begun and self._try(getattr(self._sink, method), what)
+            is_sent = has_begun and self._try(self._sink.take, event)
             self.n_sent += is_sent
             self.n_failed += not is_sent
         self._try(self._sink.close)
 
-    def _next(self) -> tuple[str, object] | None:
+    def _next(self) -> Event | None:
         """Wait for an event; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_over)
@@ -167,7 +167,7 @@ class QueuedSink:
             self.warnings.append(f"--publish {self.spec}: {text}")
 
 
-class Publishing(PassingObserver):
+class Publishing(SessionObserver):
     """The sinks of a run, which are opened here; gives them events, from `begin` on.
 
     `specs` are a SINK of the command line each. `takes_stdout`: one writes to standard output.
@@ -222,10 +222,10 @@ class Publishing(PassingObserver):
             rows.append((f"to {each.spec.partition(':')[0]}", f"{each.n_sent}", note))
         return rows
 
-    def give(self, method: str, event: object) -> None:
+    def take(self, event: Event) -> None:
         if self._is_closed:  # as for the radar image of the end of a run
             return
         for each in self.queued:
-            each.put(method, event)
+            each.put(event)
             while each.warnings:  # each line comes back by `on_log`
                 self._log("run", each.warnings.pop(0), warning=True)

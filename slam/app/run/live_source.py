@@ -29,14 +29,7 @@ from slam.live.arrival_clock import ArrivalClock
 from slam.live.errors import AppError
 from slam.live.frame_sources import radar_frame
 from slam.live.odometry_track import NS_PER_S, TumSample
-from slam.live.session_records import (
-    LogLine,
-    RadarImage,
-    RadarInfo,
-    Scan,
-    SessionObserver,
-    Snapshot,
-)
+from slam.live.session_records import Event, LogLine, RadarInfo, Scan, SessionObserver
 from slam.live.ticks import (
     GRACE_NS,
     MOST_EVENTS,
@@ -46,7 +39,6 @@ from slam.live.ticks import (
     SourceEvent,
     TickAssembler,
 )
-from slam.results import SmoothedRun
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 from xethru_protocol.validation import reason_of
@@ -115,22 +107,13 @@ class LiveLog(LinkLog):
         """Write raw bytes of a port; those from before `begin` are dropped."""
         self._write(lambda log: log.on_wire(radar, way, data, host_ns))
 
-    def on_scan(self, scan: Scan) -> None:
-        super().on_scan(scan)
-        self._write(lambda log: log.on_scan(scan))
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        self._write(lambda log: log.on_snapshot(snapshot))
-
-    def on_smoothed(self, smoothed: SmoothedRun) -> None:
-        self._write(lambda log: log.on_smoothed(smoothed))
-
-    def on_image(self, image: RadarImage) -> None:
-        self._write(lambda log: log.on_image(image))
+    def take(self, event: Event) -> None:
+        super().take(event)
+        self._write(lambda log: log.take(event))
 
     def pass_on(self, line: LogLine) -> None:
         if self._sinks is not None:
-            self._write(lambda log: log.on_log(line))
+            self._write(lambda log: log.take(line))
         super().pass_on(line)
 
     def close(self) -> None:

@@ -151,7 +151,7 @@ class RollingImage(SessionObserver):
         self._n_given = self.n_patches
         image = RadarImage(t_ns=self._newest_ns, grid=self._room.grid, levels=self._room.levels)
         for outlet in self._outlets:
-            outlet.on_image(image)
+            outlet.take(image)
 
 
 class ImagePath:

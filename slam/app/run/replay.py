@@ -41,14 +41,7 @@ from slam.live.errors import AppError, OdometryError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import RecordedSession, begins_with, open_session
 from slam.live.session.state_rows import lagged_row, smoothed_row, state_row
-from slam.live.session_records import (
-    Gap,
-    LogLine,
-    RadarImage,
-    Scan,
-    SessionObserver,
-    Snapshot,
-)
+from slam.live.session_records import Event, Gap, LogLine, Scan, SessionObserver, Snapshot
 from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.operating_system import StopFlag
@@ -134,17 +127,9 @@ def play_states(
             closing.enter_context(sink)
         for record in session.played():
             stop.check()
-            for sink in (recorder, *sinks):
-                if isinstance(record, Scan):
-                    sink.on_scan(record)
-                elif isinstance(record, Snapshot):
-                    sink.on_snapshot(record)
-                elif isinstance(record, SmoothedRun):
-                    sink.on_smoothed(record)
-                elif isinstance(record, RadarImage):
-                    sink.on_image(record)
-                elif isinstance(record, LogLine):
-                    sink.on_log(record)
+            if isinstance(record, Event):
+                for sink in (recorder, *sinks):
+                    sink.take(record)
     return recorder.record()
 
 

@@ -100,7 +100,7 @@ class LinkLog(SessionObserver):
             self._waiting.append(line)
             return
         for sink in self._sinks:
-            sink.on_log(line)
+            sink.take(line)
 
     def on_scan(self, scan: Scan) -> None:
         self._t_ns = scan.t_ns
@@ -344,13 +344,13 @@ def _run(source: RunSource, observers: Sequence[SessionObserver]) -> None:
                 wall_spans_m=slam.wall_spans_m(),
             )
             for observer in observers:
-                observer.on_snapshot(snapshot)
+                observer.take(snapshot)
 
     def smooth() -> None:
         smoothed = slam.smoothed()
         if smoothed is not None:
             for observer in observers:
-                observer.on_smoothed(smoothed)
+                observer.take(smoothed)
 
     with threadpool_limits(limits=1):
         given_up = False
@@ -371,7 +371,7 @@ def _run(source: RunSource, observers: Sequence[SessionObserver]) -> None:
                 raise AppError(f"scan {scan.counter}: {error}") from None
             finally:
                 for observer in observers:
-                    observer.on_scan(scan)
+                    observer.take(scan)
             take(results)
             if not given_up and source.smoothing_asked():
                 smooth()

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.live.errors import AppError
-from slam.live.session_records import PassingObserver, Scan, SessionInfo, SessionObserver
+from slam.live.session_records import Event, Scan, SessionInfo, SessionObserver
 from xethru_protocol.cli.live import viewer
 from xethru_protocol.cli.live.viewer import HERE, ViewerKind
 from xethru_protocol.operating_system import StopFlag
@@ -130,22 +130,19 @@ class LiveView:
             time.sleep(_VIEW_POLL_S)
 
 
-class _WhileWatched(PassingObserver):
+class _WhileWatched(SessionObserver):
     """Passes everything on until the viewer has ended."""
 
     def __init__(self, view: SessionObserver, has_ended: Callable[[], bool]) -> None:
         self._view, self._has_ended = view, has_ended
         self._is_watched = True
 
-    def on_scan(self, scan: Scan) -> None:
-        if self._is_watched and self._has_ended():
+    def take(self, event: Event) -> None:
+        if self._is_watched and isinstance(event, Scan) and self._has_ended():
             self._is_watched = False
             note("the viewer was closed; the run goes on without it")
-        super().on_scan(scan)
-
-    def give(self, method: str, event: object) -> None:
         if self._is_watched:
-            getattr(self._view, method)(event)
+            self._view.take(event)
 
     def close(self) -> None:
         self._view.close()

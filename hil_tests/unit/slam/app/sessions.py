@@ -214,11 +214,11 @@ class NoSlam:
 
 def feed(observer: SessionObserver, n_scans: int) -> None:
     """Give an observer a whole session of two radars, without closing it."""
-    observer.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="Ping -> Pong"))
+    observer.take(LogLine(t_ns=0, radar="radar0", warning=False, text="Ping -> Pong"))
     for counter in range(n_scans):
-        observer.on_scan(scan(counter))
-        observer.on_snapshot(snapshot(counter))
-    observer.on_log(LogLine(t_ns=5, radar="radar1", warning=True, text="CRC fault"))
+        observer.take(scan(counter))
+        observer.take(snapshot(counter))
+    observer.take(LogLine(t_ns=5, radar="radar1", warning=True, text="CRC fault"))
 
 
 def odometry(n_poses: int) -> OdometryTrack:

@@ -68,7 +68,7 @@ def test_a_disk_that_fills_up_is_said_once_and_the_run_goes_on(
     listener.attach(heard)
     for number in range(3):
         listener.on_odometry(pose(3 + number))
-        listener.on_scan(scan(number))
+        listener.take(scan(number))
     listener.close()
     log.close()
     (line,) = heard.lines

@@ -162,7 +162,7 @@ def publish(spec: str, counters: range) -> tuple[tuple[int, int, int], list[str]
         (queued,) = seen.queued
         for count, counter in enumerate(counters):
             wait_until(lambda done=count: queued.n_sent + queued.n_failed == done)  # type: ignore[misc]  # mypy infers no lambda with a default
-            seen.on_snapshot(snapshot(counter))
+            seen.take(snapshot(counter))
     return (queued.n_sent, queued.n_dropped, queued.n_failed), lines
 
 
@@ -183,10 +183,10 @@ def test_a_full_disk_cuts_no_line_and_the_next_has_the_whole_map(tmp_path: Path)
         seen.begin(session_info(), lines)
         with full_disk(1000):
             for counter in range(6):
-                seen.on_snapshot(snapshot(counter))
+                seen.take(snapshot(counter))
             wait_until(lambda: queued.n_sent + queued.n_failed == 6)
         for counter in range(6, 8):
-            seen.on_snapshot(snapshot(counter))
+            seen.take(snapshot(counter))
     n_sent, n_failed = queued.n_sent, queued.n_failed
     assert n_failed > 0
     assert n_sent + n_failed == 8
@@ -228,20 +228,20 @@ def test_a_pipe_without_reader_costs_nothing_and_one_whose_reader_goes_is_logged
         (queued,) = seen.queued
         seen.begin(session_info(), lines)
         for counter in range(2):
-            seen.on_snapshot(snapshot(counter))
+            seen.take(snapshot(counter))
         assert queued.n_sent == 0
         reader.start()
         reader.join()
-        seen.on_snapshot(snapshot(2))
+        seen.take(snapshot(2))
         wait_until(lambda: queued.n_failed == 1)
-        seen.on_snapshot(snapshot(3))
+        seen.take(snapshot(3))
     assert [json.loads(line)["t_ns"] for line in got] == [0, FRAME_NS]
     assert len(lines) == 1
     monkeypatch.setattr("slam.app.publish.sinks.CLOSE_S", 0.1)
     lines.clear()
     with Publishing([f"jsonl:{pipe}"]) as seen:
         seen.begin(session_info(), lines)
-        seen.on_snapshot(snapshot(0))
+        seen.take(snapshot(0))
     assert seen.queued[0].n_dropped == 1
     os.close(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))  # lets the thread of the sink go
 
@@ -257,16 +257,16 @@ def test_a_receiver_that_goes_and_comes_again_gets_the_whole_map() -> None:
         seen.begin(session_info(), lines)
         with receiver:
             for counter in range(2):
-                seen.on_snapshot(snapshot(counter))
+                seen.take(snapshot(counter))
             first = [json.loads(receiver.recv(MOST_BYTES)) for _ in range(2)]
         for counter in range(2, 6):
-            seen.on_snapshot(snapshot(counter))
+            seen.take(snapshot(counter))
         wait_until(lambda: queued.n_sent + queued.n_failed == 6)
         assert queued.n_failed > 0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
             again.bind(address)
             again.settimeout(10.0)
-            seen.on_snapshot(snapshot(6))
+            seen.take(snapshot(6))
             later = json.loads(again.recv(MOST_BYTES))
     assert [one["reset"] for one in first] == [True, False]
     assert (later["t_ns"], later["reset"], len(later["landmarks"])) == (6 * FRAME_NS, True, 2)
@@ -354,13 +354,13 @@ def test_a_viewer_that_never_reads_holds_up_neither_the_run_nor_its_end(
         assert viewer.recv(100).startswith(b"HTTP/1.1 101 ")
         seen.begin(session_info(), Lines())
         (queued,) = seen.queued
-        seen.on_snapshot(snapshot(0))
+        seen.take(snapshot(0))
         wait_until(lambda: queued.n_sent == 1)  # its topics are there
         ids = [{"id": number, "channelId": number} for number in range(1, 50)]
         text = json.dumps({"op": "subscribe", "subscriptions": ids}).encode()
         viewer.sendall(b"\x81\xfe" + struct.pack(">H4x", len(text)) + text)
         for counter in range(1, 1201):
-            seen.on_scan(scan(counter))
+            seen.take(scan(counter))
             if counter % 100 == 0:
                 wait_until(lambda sent=counter: queued.n_sent > sent)  # type: ignore[misc]  # mypy infers no lambda with a default
         seen.close()  # the viewer answers no more than it reads

@@ -232,7 +232,7 @@ def test_a_subscriber_that_goes_or_never_takes_costs_the_run_nothing(space: str)
             each.wait_for_publisher()
         publishing.begin(info, log)
         for counter in range(100):
-            publishing.on_snapshot(snapshot(counter))
+            publishing.take(snapshot(counter))
             if counter == 10:
                 goes.take(1)
                 goes.close()

@@ -80,7 +80,7 @@ def publish(*specs: str, n_states: int) -> tuple[Publishing, Lines]:
         feed(publishing, n_states)
         last = publishing.queued[-1]
         wait_until(lambda: last.n_sent + last.n_failed + last.n_dropped == n_states)
-        publishing.on_snapshot(snapshot(n_states))
+        publishing.take(snapshot(n_states))
     return publishing, lines
 
 
@@ -120,10 +120,10 @@ def test_the_newest_states_are_those_that_stay() -> None:
     lines = Lines()
     with Publishing(["list:blocked"]) as publishing:
         publishing.begin(session_info(), lines)
-        publishing.on_snapshot(snapshot(0))
+        publishing.take(snapshot(0))
         assert ENTERED.wait(15.0)
         for counter in range(1, n_states):
-            publishing.on_snapshot(snapshot(counter))
+            publishing.take(snapshot(counter))
         RELEASED.set()
     assert MADE[0].got[2:-1] == [0, *range(n_states - MOST_EVENTS, n_states)]
     assert counts(publishing) == [(MOST_EVENTS + 1, MOST_EVENTS - 1, 0)]
