@@ -581,19 +581,22 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
 
 def _add_map(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
-    for name, text, count, written in (
-        ("show", "print a map as a table, or draw it", 1, _output(".png", what="a picture")),
-        ("convert", "write a map as GeoJSON, in local metres", 1, Path),
-        ("join", "make one map of two", 2, _output(".json", what="a map")),
+    for name, text, count in (
+        ("show", "print a map as a table", 1),
+        ("convert", "write a map as GeoJSON, in local metres", 1),
+        ("join", "make one map of two", 2),
     ):
         action = actions.add_parser(name, help=text, description=text)
         action.add_argument("files", type=Path, nargs=count, metavar="MAP", help="from --save-map")
         if name == "convert":
-            action.add_argument("out", type=written, metavar="OUT.geojson", help="to write")
-        else:
-            required = name == "join"
+            action.add_argument("out", type=Path, metavar="OUT.geojson", help="to write")
+        elif name == "join":
             action.add_argument(
-                "--out", type=written, metavar="OUT", required=required, help="file to write"
+                "--out",
+                type=_output(".json", what="a map"),
+                metavar="OUT",
+                required=True,
+                help="file to write",
             )
 
 

@@ -73,11 +73,10 @@ def test_maps_are_shown_converted_and_joined(
 ) -> None:
     one, two = str(days / "one.json"), str(days / "two.json")
     file = load_map(one)
-    assert main(["map", "show", one, "--out", str(tmp_path / "one.png")]) == 0
+    assert main(["map", "show", one]) == 0
     said = capsys.readouterr().out
     assert file.id in said
     assert all(f"landmark {each.id}" in said for each in file.map.landmarks)
-    assert (tmp_path / "one.png").stat().st_size > 1000
     assert main(["map", "convert", one, str(tmp_path / "one.geojson")]) == 0
     places = json.loads((tmp_path / "one.geojson").read_text())["features"]
     assert [

@@ -1,4 +1,4 @@
-"""`uwb-slam map`: saved maps as a table or a picture, as GeoJSON, and two as one."""
+"""`uwb-slam map`: saved maps as a table, as GeoJSON, and two as one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FRAME = (
 )
 
 
-def run_map(stop: StopFlag, *, action: str, files: list[Path], out: Path | None) -> None:
+def run_map(stop: StopFlag, *, action: str, files: list[Path], out: Path | None = None) -> None:
     """Show a map, convert it, or join two."""
     try:
         maps = [load_map(path) for path in files]
@@ -36,10 +36,10 @@ def run_map(stop: StopFlag, *, action: str, files: list[Path], out: Path | None)
         elif action == "convert" and out is not None:
             _convert(maps[0].map, out)
         else:
-            _show(files[0], maps[0], out)
+            _show(files[0], maps[0])
 
 
-def _show(path: Path, file: MapFile, out: Path | None) -> None:
+def _show(path: Path, file: MapFile) -> None:
     saved = file.map
     made = ", ".join(f"{key} {value}" for key, value in file.made.items())
     sigmas_m = np.sqrt(saved.landmarks_covariance().diagonal().reshape(-1, 2).sum(axis=1))
@@ -64,23 +64,6 @@ def _show(path: Path, file: MapFile, out: Path | None) -> None:
         for radar in saved.radars
     ]
     print_table("ranges are longer by", ["", "rig file", "and found"], names)
-    if out is not None:
-        _draw(saved, sigmas_m, out)
-
-
-def _draw(saved: SavedMap, sigmas_m: np.ndarray, out: Path) -> None:
-    # loads matplotlib, half a second
-    from slam.app.run.pictures import picture
-
-    with picture(out, width_in=7.0, height_in=7.0) as figure:
-        axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-        for wall in saved.walls:
-            for span in wall_spans_m(wall, WallRule().cell_m):
-                axes.plot(*span.T, color="0.3", linewidth=2)
-        for one, sigma_m in zip(saved.landmarks, sigmas_m.tolist(), strict=True):
-            axes.errorbar(one.x_m, one.y_m, sigma_m, sigma_m, "k.", linewidth=0.8)
-            axes.annotate(str(one.id), (one.x_m, one.y_m), (4, 4), textcoords="offset points")
-        axes.plot(saved.start[0], saved.start[1], "b^")
 
 
 def _convert(saved: SavedMap, out: Path) -> None:
