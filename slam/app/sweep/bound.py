@@ -43,16 +43,13 @@ from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
 from slam.library.evaluation import ate_rmse_m
-from slam.live.errors import AppError
 from slam.live.session_records import SessionObserver, Snapshot
 from slam.robust.association import LONGEST_M, crossings
 from slam.robust.state import calibrated_motion, quarter_turn, rotation, turned_covariance
-from xethru_protocol.optional_packages import install_command
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
 
-PURPOSE = "the known-association bound"
 GATE_SIGMAS = 4.0
 VIEW_HALF_ANGLE_RAD = 0.82
 """Half of the field of view, 32.5 deg, and 0.25 rad where echoes are weak."""
@@ -66,16 +63,6 @@ POSE_THRESHOLD, CALIBRATION_THRESHOLD, LANDMARK_THRESHOLD_M = 0.01, 0.003, 0.01
 RELINEARISE_EVERY = 10
 _PAPER_RANGE_SIGMA_M = 7.4e-3
 """Of the paper's front end, which predicts none: 7.1 to 8.0 mm at 30 to 44 dB, whatever the SNR."""
-
-
-def load_gtsam(purpose: str) -> Any:  # noqa: ANN401 - types must not depend on an optional package
-    """Return the module ``gtsam``; raise AppError if it is not installed."""
-    try:
-        return import_module("gtsam")
-    except ImportError:
-        raise AppError(
-            f"{purpose} needs GTSAM, which is not installed: {install_command('gtsam')}"
-        ) from None
 
 
 def wheel_residual(before: Pose, after: Pose, calibration: Pose, increment: Pose) -> Array:
@@ -367,7 +354,8 @@ def solve_known(
     """Return the paths of labelled data.
 
     ``rig`` and ``wheels`` are as SLAM knew them; ``offset_sigma_m`` is the standard deviation of
-    each radar's unknown range offset, zero if they are calibrated. Raises AppError without GTSAM.
+    each radar's unknown range offset, zero if they are calibrated. Raises
+    ModuleNotFoundError without GTSAM.
     """
     return _FactorGraph(rig, wheels, offset_sigma_m).solve(run)
 
@@ -376,7 +364,7 @@ class _FactorGraph:
     """The growing factor graph."""
 
     def __init__(self, rig: Rig, wheels: WheelNoise, offset_sigma_m: float) -> None:
-        self._gtsam = gtsam = load_gtsam(PURPOSE)
+        self._gtsam = gtsam = import_module("gtsam")  # of an extra, so without types
         symbols = gtsam.symbol_shorthand
         self._X, self._L, self._C, self._B = symbols.X, symbols.L, symbols.C, symbols.B
         self._rig, self._wheels = rig, wheels
@@ -535,7 +523,7 @@ def bound_of(
     """Return the bound of a run that has a state.
 
     Rig, wheels and offsets are those that SLAM knew; the truth only gives each range its landmark.
-    Raises AppError without GTSAM.
+    Raises ModuleNotFoundError without GTSAM.
     """
     is_robust = config.back_end is BackEnd.ROBUST
     rig = rig_of(scene)

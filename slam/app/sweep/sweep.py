@@ -17,6 +17,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, replace
 from datetime import timedelta
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 
@@ -28,7 +29,6 @@ from slam.app.rig.emulated import FRAME_RATE_HZ
 from slam.app.run.output import note, print_progress, print_table, print_text
 from slam.app.run.result_files import made_folder
 from slam.app.sweep import CLEAN
-from slam.app.sweep.bound import PURPOSE, load_gtsam
 from slam.app.sweep.run import Case, RunKey, SweepRun, make_case, program_version, run_case
 from slam.app.sweep.statistics import outcomes, summarise_groups
 from slam.app.sweep.table import (
@@ -207,7 +207,7 @@ def run_sweep(
     )
     cases = [replace(case, fps=fps) for case in cases]
     if bound:
-        load_gtsam(PURPOSE)
+        import_module("gtsam")  # what is missing ends the command before any run, too
     if out.is_dir():
         raise AppError(f"{out}: is a folder, must be a file")
     if out.exists() and not out.is_file():

@@ -24,7 +24,6 @@ from joblib.externals.loky.backend import resource_tracker as loky_tracker
 from slam.app.errors import UsageError
 from slam.live.errors import AppError
 from xethru_protocol.operating_system import signal_at_parents_death
-from xethru_protocol.optional_packages import install_command
 
 _LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
@@ -128,9 +127,9 @@ def dask_results(
     ``function``, importable by name on every worker, is called with the members of each of the
     tasks, of which there is at least one. Leaving the block cancels what is not done.
 
-    Raises UsageError if the address is invalid or Dask is not installed, AppError if no scheduler
-    or no worker answers there; AppError while results are awaited if the scheduler goes away or a
-    task takes down every worker that it is given to.
+    Raises UsageError if the address is invalid, ModuleNotFoundError without Dask, AppError if no
+    scheduler or no worker answers there; AppError while results are awaited if the scheduler goes
+    away or a task takes down every worker that it is given to.
     """
     client = _connect(address)
     futures: list[Any] = []
@@ -143,10 +142,8 @@ def dask_results(
 
 
 def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
-    try:
-        import distributed  # heavy, and an extra
-    except ImportError:
-        raise UsageError(f"--dask: Dask is not installed: {install_command('dask')}") from None
+    import distributed  # heavy, and an extra
+
     # what goes wrong becomes one line of ours
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from hil_tests.unit.slam.robust.range_world import (
     reported,
     true_path,
 )
+from slam.app.cli import main
 from slam.app.sweep.bound import (
     ALONE_RANGES,
     KnownAssociation,
@@ -39,7 +41,6 @@ from slam.app.sweep.bound import (
 from slam.config import WheelNoise
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, compose, mount_at, paper_rig
-from slam.live.errors import AppError
 from slam.paper.ekf import start
 from slam.results import StepResult
 from slam.robust.parameters import BackEndParameters, RangeNoise, RelinearisationRule
@@ -214,11 +215,13 @@ def test_wandering_calibration_errors_get_sets_of_their_own() -> None:
     assert 0.0 < np.abs(wander.calibration - still.calibration).max() < 3 * sigma
 
 
-def test_without_gtsam_the_bound_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_gtsam_the_bound_is_refused_before_any_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    run = KnownRun(increments=np.zeros((1, 3)), ranges=((),))
-    with pytest.raises(AppError):
-        solve_known(run, paper_rig(), WheelNoise())
+    assert main(["sweep", "--seeds", "1", "--bound", "--json", str(tmp_path / "out.json")]) == 2
+    assert "[gtsam]" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("calibration", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01)])
