@@ -44,7 +44,7 @@ from slam.app.run.result_files import (
     remove_earlier,
     write_smoothed,
 )
-from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, WrappedSlam, execute
+from slam.app.run.runner import RunRecord, RunSource, StepGivenUpError, execute
 from slam.app.session.constants import slam_constants
 from slam.app.session.writer import SessionLog
 from slam.app.view.viewer import LiveView
@@ -138,14 +138,14 @@ def run_rig(
             )
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
-        pipeline = make_slam(
+        slam = make_slam(
             config,
             rig_file.rig,
             rig_file.wheels.noise,
             noise_at=live_odometry.noise_at if covariance else None,
             on_map=begin.on_map,
         )
-        slam = held.enter_context(PromptSlam(pipeline, stop))
+        prompt = held.enter_context(PromptSteps(slam, stop))
         log = LiveLog()
         live = LiveSource(
             rig_source.radars,
@@ -191,6 +191,7 @@ def run_rig(
                 link_log=log,
                 smoothing_asked=requests.asked,
                 map_file=begin.file,
+                step=prompt.step,
             )
             map_saver = MapSaver(maps.get("save_map"), slam, info)
             remove_earlier(out, (*RESULTS, *_STALE))
@@ -225,7 +226,7 @@ def run_rig(
                 source,
                 record,
                 StopFlag(),
-                _rows(record, live, live_odometry, slam, image),
+                _rows(record, live, live_odometry, prompt, image),
                 publishing=publishing,
                 map_saver=map_saver,
             )
@@ -245,16 +246,15 @@ def _prepare_the_end() -> None:
     atexit.register(gc.freeze)
 
 
-class PromptSlam(WrappedSlam):
-    """SLAM that gives up the step in hand if it takes longer than 0.3 s after a signal.
+class PromptSteps:
+    """Steps SLAM, and gives up the step in hand if it takes longer than 0.3 s after a signal.
 
     A step may take seconds on a busy machine, and must not hold up the end of a run in real time.
     It watches the flag while it is entered, in the main thread. `step` raises StepGivenUpError.
     """
 
     def __init__(self, slam: Pipeline, stop: StopFlag) -> None:
-        super().__init__(slam)
-        self._stop = stop
+        self._slam, self._stop = slam, stop
         self._in_step = False
         self.n_given_up = 0
         self._cleanup = ExitStack()
@@ -384,10 +384,10 @@ def _rows(
     record: RunRecord,
     live: LiveSource,
     odometry: LiveOdometry,
-    slam: PromptSlam,
+    prompt: PromptSteps,
     image: RollingImage,
 ) -> list[ResultRow]:
-    left_out = live.ticks.n_unused - live.ticks.n_dropped + slam.n_given_up
+    left_out = live.ticks.n_unused - live.ticks.n_dropped + prompt.n_given_up
     load = live.busy_s / max(record.duration_ns / NS_PER_S, 1e-9)
     rows = [
         (

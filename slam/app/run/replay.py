@@ -31,18 +31,18 @@ from slam.app.run.runner import (
     RunRecord,
     RunRecorder,
     RunSource,
-    WrappedSlam,
+    Step,
     execute,
 )
 from slam.app.session.constants import different_constants, recorded_rules
-from slam.frames import Detection, RadarFrame
+from slam.frames import Detection
 from slam.library.slam import make_slam
 from slam.live.errors import AppError, OdometryError
 from slam.live.odometry_track import NS_PER_S, OdometryTrack, TumSample
 from slam.live.session.reader import RecordedSession, begins_with, open_session
 from slam.live.session.state_rows import lagged_row, smoothed_row, state_row
 from slam.live.session_records import Event, Gap, LogLine, Scan, SessionObserver, Snapshot
-from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
+from slam.results import Pipeline, SmoothedRun
 from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings.mcap import MAGIC
@@ -163,20 +163,9 @@ def _has_state(session: RecordedSession, stop: StopFlag) -> bool:
     return False
 
 
-class _RecordedSlam(WrappedSlam):
-    """Steps a pipeline with recorded detections instead of frames.
-
-    They are by the time of the scan [ns]; a scan without entry has none.
-    """
-
-    def __init__(self, slam: Pipeline, detections: Mapping[int, Sequence[Detection]]) -> None:
-        super().__init__(slam)
-        self._detections = detections
-
-    def step(
-        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
-    ) -> tuple[StepResult, ...]:
-        return self.step_detections(self._detections.get(t_ns, ()), pose_at, t_ns)
+def _step_of_detections(slam: Pipeline, detections: Mapping[int, Sequence[Detection]]) -> Step:
+    """Return what steps SLAM with recorded detections, by the time of the scan [ns]."""
+    return lambda _, pose_at, t_ns: slam.step_detections(detections.get(t_ns, ()), pose_at, t_ns)
 
 
 _LONGEST_WAIT_S = 10.0
@@ -276,13 +265,16 @@ def recorded_source(
     return RunSource(
         info=session.info,
         rig=session.rig,
-        slam=_RecordedSlam(slam, session.detections()) if session.info.has_detections else slam,
+        slam=slam,
         scans=scans,
         odometry=odometry,
         truth_at=scans.truth_at,
         lost_frames=lambda: scans.lost.n_lost,
         link_log=scans.link_log,
         map_file=begin.file,
+        step=_step_of_detections(slam, session.detections())
+        if session.info.has_detections
+        else None,
     )
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,21 +34,13 @@ from slam.live.session_records import (
     Snapshot,
     TruthAt,
 )
-from slam.results import Pipeline, SmoothedRun, StepResult
+from slam.results import Pipeline, PoseAt, SmoothedRun, StepResult
 from slam.robust.solver.growing_arrays import PackedRows
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.matching import ProtocolRecord
 
-
-class WrappedSlam:
-    """Passes everything but `step` on to another pipeline; subclasses define that."""
-
-    def __init__(self, slam: Pipeline) -> None:
-        self._slam = slam
-        self.config = slam.config
-        self.step_detections, self.flush = slam.step_detections, slam.flush
-        self.wall_spans_m, self.smoothed = slam.wall_spans_m, slam.smoothed
-        self.saved_map, self.map_changes = slam.saved_map, slam.map_changes
+Step: TypeAlias = Callable[[Sequence[RadarFrame], PoseAt, int], tuple[StepResult, ...]]
+"""As `Pipeline.step`."""
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -114,6 +106,7 @@ class RunSource:
     between counters, over all radars. `close` is called before sinks are closed: what it logs is
     still recorded. `smoothing_asked` is called after every scan: whether sinks shall get the
     smoothed run so far. `map_file` is the map that SLAM began with, None if it was an empty one.
+    `step` is called in place of that of `slam`, if there is one.
     """
 
     info: SessionInfo
@@ -127,6 +120,7 @@ class RunSource:
     close: Callable[[], None] = lambda: None
     smoothing_asked: Callable[[], bool] = lambda: False
     map_file: MapFile | None = None
+    step: Step | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -328,6 +322,7 @@ def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunReco
 def _run(source: RunSource, observers: Sequence[SessionObserver]) -> None:
     """Feed scans to SLAM as they come, and scans and states to the observers."""
     slam, truth_at, radars = source.slam, source.truth_at, source.info.radars
+    step = source.step or slam.step
     world_from_map: NDArray[np.float64] | None = None
     if source.map_file is not None and source.map_file.world_from_map is not None:
         world_from_map = np.array(source.map_file.world_from_map)
@@ -364,7 +359,7 @@ def _run(source: RunSource, observers: Sequence[SessionObserver]) -> None:
                     stamps_ns.append(scan.t_ns)
                     counters.append(scan.counter)
                     frames = [less_gain(f, radars[f.radar].gain_db) for f in scan.frames]
-                    results = slam.step(frames, source.odometry.pose_at, scan.t_ns)
+                    results = step(frames, source.odometry.pose_at, scan.t_ns)
             except StepGivenUpError:
                 given_up, scan = True, replace(scan, used=False)
             except StepInputError as error:

@@ -20,7 +20,7 @@ from hil_tests.unit.slam.app.sessions import (
     source_of_scans,
 )
 from slam.app.commands import run
-from slam.app.commands.run import PromptSlam, SmoothingRequests, parse_clock
+from slam.app.commands.run import PromptSteps, SmoothingRequests, parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.run.live_source import LiveLog
@@ -176,9 +176,9 @@ def test_a_step_that_takes_long_after_a_signal_is_given_up_and_its_scan_is_not_u
 
     alarm = signal.getsignal(signal.SIGALRM)
     began_s = time.monotonic()
-    with stop, PromptSlam(slam, stop) as prompt:
+    with stop, PromptSteps(slam, stop) as prompt:
         track = OdometryTrack([pose(0), pose(10**10)])
-        execute(source_of_scans(scans(), track, prompt), [heard])
+        execute(replace(source_of_scans(scans(), track, slam), step=prompt.step), [heard])
     assert time.monotonic() - began_s < seconds(30)
     assert [one.used for one in heard.scans] == [True, used]
     assert prompt.n_given_up == (not used)

@@ -27,7 +27,7 @@ from slam.app.odometry.live import LiveOdometry
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.run.live_source import LiveLog, LiveSource
 from slam.app.run.replay import Comparison, recorded_source
-from slam.app.run.runner import RunRecord, RunSource, WrappedSlam, execute
+from slam.app.run.runner import RunRecord, RunSource, Step, execute
 from slam.app.session.writer import SessionLog
 from slam.config import load_preset
 from slam.frames import RadarFrame
@@ -52,18 +52,14 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return drive_through(load_scene(write_short_scene(tmp_path_factory.mktemp("scene"))))
 
 
-class SlowSlam(WrappedSlam):
-    """SLAM whose every step takes so much longer, of virtual time."""
+def slow_step(slam: Pipeline, inbox: VirtualInbox, more_s: float) -> Step:
+    """Return the step of SLAM, which takes so much longer, of virtual time."""
 
-    def __init__(self, slam: Pipeline, inbox: VirtualInbox, more_s: float) -> None:
-        super().__init__(slam)
-        self._inbox, self._more_ns = inbox, round(more_s * NS_PER_S)
+    def step(frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int) -> tuple[StepResult, ...]:
+        inbox.now_ns += round(more_s * NS_PER_S)
+        return slam.step(frames, pose_at, t_ns)
 
-    def step(
-        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
-    ) -> tuple[StepResult, ...]:
-        self._inbox.now_ns += self._more_ns
-        return self._slam.step(frames, pose_at, t_ns)
+    return step
 
 
 class SignalAt(StopFlag):
@@ -149,7 +145,8 @@ class Overloaded:
         source = RunSource(
             info=info,
             rig=rig_of(drive.scene),
-            slam=SlowSlam(slam, self.inbox, self.more_s),
+            slam=slam,
+            step=slow_step(slam, self.inbox, self.more_s),
             scans=self.given.noted(self.live.scans()),
             odometry=odometry,
             link_log=log,
