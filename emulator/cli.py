@@ -352,12 +352,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     with stop.leaving(0):  # the imports take most of a second
         # heavy, and only now: --help and usage errors answer at once
-        from emulator.serve_play_proxy import CannotServeError, play, proxy, serve
+        from emulator.scene.scene import UnknownSceneError
+        from emulator.serve_play_proxy import EXPECTED, play, proxy, serve
     start = {"serve": serve, "play": play, "proxy": proxy}
     try:
         start[arguments.command](arguments, stop, _warn)
-    except CannotServeError as error:
-        return _failed(str(error), exit_code=error.exit_code)
+    except EXPECTED as error:
+        return _failed(str(error), exit_code=2 if isinstance(error, UnknownSceneError) else 1)
     except StopRequestedError:  # while a file of its input was waited for
         pass
     return 0

@@ -34,7 +34,7 @@ from emulator.ports.runtime_folders import (
     socket_path,
 )
 from emulator.ports.sockets import OdometryFeed
-from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
+from emulator.scene.scene import SceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from emulator.x4m300 import PortDevice, radar_device
 from xethru_protocol.operating_system import STDOUT, StopFlag, json_text, waiting
@@ -51,6 +51,8 @@ FIRST_BARE, BARE_SERIALS = 100_000_000_000, 100
 """Bare modules have serial numbers from it to twice as much; a process has so many of them."""
 Warn = Callable[[str], None]
 """Gets a warning in one line."""
+EXPECTED = (SceneError, FaultPlanError, LinkError, RecordingError, PortUnavailable)
+"""Raised by `serve`, `play` and `proxy`; the message is one line with the remedy."""
 
 
 class FaultSession:
@@ -127,20 +129,6 @@ class FaultSession:
         return offered
 
 
-class CannotServeError(Exception):
-    """The emulator could not start; the message is one line with the remedy.
-
-    Attributes
-    ----------
-    exit_code
-        1 when the thing failed, 2 when it was called wrongly.
-    """
-
-    def __init__(self, message: str, *, exit_code: int = 1) -> None:
-        super().__init__(message)
-        self.exit_code = exit_code
-
-
 def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
@@ -148,69 +136,57 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     ----------
     options
         Those of the command, as `emulator.cli` parses them; likewise for `play` and `proxy`.
-
-    Raises
-    ------
-    CannotServeError
-        When scene, fault scenario or ports cannot be had.
     """
     links = _link_options(options, warn)
     state_dir: Path | None = options.state_dir
     with contextlib.ExitStack() as cleanup:
-        try:
-            if state_dir is not None:
-                make_state_directory(state_dir)
-            scene = empty_room(options.count) if options.bare else load_scene(options.scene)
-            folder = cleanup.enter_context(link_folder(options.link_dir))
-            zero_ns = time.monotonic_ns()
-            session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
-            stays = links.port_on_reset == "stay"
-            asked = {"model": options.model, "firmware": options.firmware}
-            changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
-            changes |= {name: value for name, value in asked.items() if value is not None}
-            devices = []
-            serials = _serials(options, [radar.serial for radar in scene.radars])
-            for index, (radar, serial) in enumerate(zip(scene.radars, serials, strict=True)):
-                of_radar = {"model": radar.model or STOCK_MODEL}
-                device_options = DeviceOptions.model_validate(of_radar | changes)
-                device = radar_device(
-                    Identity(serial=serial, order_code=device_options.product.order_code),
-                    echo_source(scene, index, options.seed),
-                    options.pace,
-                    scene_time_zero_ns=zero_ns,
-                    clock=radar.clock,
-                    options=device_options,
-                    memory=None if state_dir is None else DirectoryMemory(state_dir, serial, warn),
-                )
-                faulty = session.wrap(device, radar.name)
-                devices.append(
-                    NamedDevice(
-                        name=radar.name,
-                        serial=serial,
-                        device=faulty,
-                        start_skew_ns=radar.clock.skew_ns,
-                        present=faulty.port_present,
-                        uart_baud=partial(getattr, device.module, "uart_baudrate"),
-                    )
-                )
-            session.check_names()
-            control = session.control(
-                folder, people=partial(people_truth, scene, seed=options.seed)
+        if state_dir is not None:
+            make_state_directory(state_dir)
+        scene = empty_room(options.count) if options.bare else load_scene(options.scene)
+        folder = cleanup.enter_context(link_folder(options.link_dir))
+        zero_ns = time.monotonic_ns()
+        session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+        stays = links.port_on_reset == "stay"
+        asked = {"model": options.model, "firmware": options.firmware}
+        changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
+        changes |= {name: value for name, value in asked.items() if value is not None}
+        devices = []
+        serials = _serials(options, [radar.serial for radar in scene.radars])
+        for index, (radar, serial) in enumerate(zip(scene.radars, serials, strict=True)):
+            of_radar = {"model": radar.model or STOCK_MODEL}
+            device_options = DeviceOptions.model_validate(of_radar | changes)
+            device = radar_device(
+                Identity(serial=serial, order_code=device_options.product.order_code),
+                echo_source(scene, index, options.seed),
+                options.pace,
+                scene_time_zero_ns=zero_ns,
+                clock=radar.clock,
+                options=device_options,
+                memory=None if state_dir is None else DirectoryMemory(state_dir, serial, warn),
             )
-            feed = None
-            if not options.bare:
-                feed = OdometryFeed(
-                    socket_path(folder, cleanup, SOCKET_NAME),
-                    scene_odometry(scene, options.seed),
-                    options.pace,
-                    scene_time_zero_ns=zero_ns,
+            faulty = session.wrap(device, radar.name)
+            devices.append(
+                NamedDevice(
+                    name=radar.name,
+                    serial=serial,
+                    device=faulty,
+                    start_skew_ns=radar.clock.skew_ns,
+                    present=faulty.port_present,
+                    uart_baud=partial(getattr, device.module, "uart_baudrate"),
                 )
-                cleanup.callback(feed.close)
-            ports = DevicePorts(devices, folder, links, cleanup)
-        except UnknownSceneError as error:
-            raise CannotServeError(str(error), exit_code=2) from error
-        except (SceneError, LinkError, FaultPlanError) as error:
-            raise CannotServeError(str(error)) from error
+            )
+        session.check_names()
+        control = session.control(folder, people=partial(people_truth, scene, seed=options.seed))
+        feed = None
+        if not options.bare:
+            feed = OdometryFeed(
+                socket_path(folder, cleanup, SOCKET_NAME),
+                scene_odometry(scene, options.seed),
+                options.pace,
+                scene_time_zero_ns=zero_ns,
+            )
+            cleanup.callback(feed.close)
+        ports = DevicePorts(devices, folder, links, cleanup)
         _run(ports, control, [], stop, cleanup, zero_ns=zero_ns, feed=feed)
 
 
@@ -233,35 +209,24 @@ def _serials(options: Namespace, of_scene: Sequence[str]) -> list[str]:
 
 
 def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
-    """Play a recording, each radar at a port of its own, until a signal asks for the end.
-
-    Raises
-    ------
-    CannotServeError
-        When the recording cannot be read or a port cannot be had.
-    """
+    """Play a recording, each radar at a port of its own, until a signal asks for the end."""
     with contextlib.ExitStack() as cleanup:
-        try:
-            radars = played_radars(
-                options.recording,
-                rate=options.rate,
-                loop=options.loop,
-                on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
-                warn=warn,
-            )
-            folder = cleanup.enter_context(link_folder(options.link_dir))
-            session = FaultSession(None, None, cleanup, zero_ns=time.monotonic_ns())
-            devices = [
-                NamedDevice(
-                    name=one.name, serial=one.serial, device=session.wrap(one.device, one.name)
-                )
-                for one in radars
-            ]
-            players = {radar.name: radar.stream for radar in radars}
-            control = session.control(folder, players)
-            ports = DevicePorts(devices, folder, LinkOptions(), cleanup)
-        except (RecordingError, LinkError) as error:
-            raise CannotServeError(str(error)) from error
+        radars = played_radars(
+            options.recording,
+            rate=options.rate,
+            loop=options.loop,
+            on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
+            warn=warn,
+        )
+        folder = cleanup.enter_context(link_folder(options.link_dir))
+        session = FaultSession(None, None, cleanup, zero_ns=time.monotonic_ns())
+        devices = [
+            NamedDevice(name=one.name, serial=one.serial, device=session.wrap(one.device, one.name))
+            for one in radars
+        ]
+        players = {radar.name: radar.stream for radar in radars}
+        control = session.control(folder, players)
+        ports = DevicePorts(devices, folder, LinkOptions(), cleanup)
         watches = [
             PortWatch(
                 os.fspath(folder / radar.name),
@@ -276,38 +241,24 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
 
 
 def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
-    """Put faults on the line of a real module until a signal asks for the end.
-
-    Raises
-    ------
-    CannotServeError
-        When the module's port, the scenario or our own port cannot be had, or the module vanishes.
-    """
+    """Put faults on the line of a real module until a signal asks for the end."""
     with contextlib.ExitStack() as cleanup:
-        try:
-            capture = None
-            if options.wire is not None:
-                capture = cleanup.enter_context(WireCapture(options.wire, {"port": options.port}))
-            zero_ns = time.monotonic_ns()
-            session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
-            module = ModuleLine(open_line(options.port, options.baud), capture, stop.request)
-            cleanup.callback(module.close)
-            faulty = session.wrap(module, PROXY_NAME)
-            session.check_names()
-            folder = cleanup.enter_context(link_folder(options.link_dir))
-            control = session.control(folder)
-            named = NamedDevice(
-                name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
-            )
-            ports = DevicePorts([named], folder, LinkOptions(), cleanup)
-        except (PortUnavailable, RecordingError, LinkError, FaultPlanError) as error:
-            raise CannotServeError(str(error)) from error
-        try:
-            _run(ports, control, [module], stop, cleanup, zero_ns=zero_ns)
-        except RecordingError as error:  # the capture's disk is full
-            raise CannotServeError(str(error)) from error
+        capture = None
+        if options.wire is not None:
+            capture = cleanup.enter_context(WireCapture(options.wire, {"port": options.port}))
+        zero_ns = time.monotonic_ns()
+        session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+        module = ModuleLine(open_line(options.port, options.baud), capture, stop.request)
+        cleanup.callback(module.close)
+        faulty = session.wrap(module, PROXY_NAME)
+        session.check_names()
+        folder = cleanup.enter_context(link_folder(options.link_dir))
+        control = session.control(folder)
+        named = NamedDevice(name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present)
+        ports = DevicePorts([named], folder, LinkOptions(), cleanup)
+        _run(ports, control, [module], stop, cleanup, zero_ns=zero_ns)
     if not module.port_present(time.monotonic_ns()):
-        raise CannotServeError(f"{options.port}: the module's port vanished")
+        raise PortUnavailable(f"{options.port}: the module's port vanished")
 
 
 def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
@@ -350,5 +301,5 @@ def _run(
     ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
     STDOUT.write(json_text(ready, separators=(",", ":")) + "\n")
     if STDOUT.failure is not None:  # ports that were not announced are of no use
-        raise CannotServeError(f"stdout: cannot write the ready line: {STDOUT.failure.strerror}")
+        raise LinkError(f"stdout: cannot write the ready line: {STDOUT.failure.strerror}")
     server.run()
