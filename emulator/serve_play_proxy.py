@@ -7,10 +7,9 @@ import os
 import secrets
 import time
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TextIO
 
 from emulator.echo.echo import echo_source
 from emulator.echo.people import people_truth
@@ -18,8 +17,8 @@ from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity
 from emulator.module.settings import STOCK_MODEL, DeviceOptions
-from emulator.playback import PlayStream, played_radars
-from emulator.ports.control import Control, ControlSocket, People
+from emulator.playback import played_radars
+from emulator.ports.control import Control, ControlSocket
 from emulator.ports.event_loop import Server, Service
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.proxy import ModuleLine
@@ -36,7 +35,7 @@ from emulator.ports.runtime_folders import (
 from emulator.ports.sockets import OdometryFeed
 from emulator.scene.scene import SceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
-from emulator.x4m300 import PortDevice, radar_device
+from emulator.x4m300 import radar_device
 from xethru_protocol.operating_system import STDOUT, StopFlag, json_text, waiting
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import WireCapture
@@ -55,78 +54,29 @@ EXPECTED = (SceneError, FaultPlanError, LinkError, RecordingError, PortUnavailab
 """Raised by `serve`, `play` and `proxy`; the message is one line with the remedy."""
 
 
-class FaultSession:
-    """The faults of all radars: one scenario, one truth log, one control socket.
+def _fault_plan(scenario: str | None, radars: Collection[str]) -> FaultPlan:
+    """Return the faults of a scenario; none without one, until the control socket adds some."""
+    plan = FaultPlan() if scenario is None else load_plan(scenario)
+    for index, spec in enumerate(plan.fault):
+        for name in spec.radar:
+            if name not in radars:
+                raise FaultPlanError(
+                    f"fault[{index}].radar: no radar is called {shown(name)}; "
+                    f"{choices(name, radars)}"
+                )
+    return plan
 
-    Parameters
-    ----------
-    scenario
-        Name or path; None: no faults until the control socket adds some.
-    truth
-        File of the truth log, made anew; None: none is written.
-    zero_ns
-        Device time from which the scenario counts.
 
-    Raises
-    ------
-    FaultPlanError
-        When the scenario cannot be used.
-    LinkError
-        When the truth log cannot be written.
-    """
-
-    def __init__(
-        self,
-        scenario: str | None,
-        truth: Path | None,
-        cleanup: contextlib.ExitStack,
-        *,
-        zero_ns: int,
-    ) -> None:
-        self._plan = FaultPlan() if scenario is None else load_plan(scenario)
-        self._zero_ns = zero_ns
-        self._cleanup = cleanup
-        self._truth: TextIO | None = None
-        self.devices: dict[str, FaultyDevice] = {}
-        if truth is not None:
-            try:
-                # by lines: a fault is in the file as soon as it is injected
-                with waiting():
-                    log = truth.open("w", buffering=1, encoding="utf-8")
-                self._truth = cleanup.enter_context(log)
-            except OSError as error:
-                raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
-
-    def _note(self, injected: Injected) -> None:
-        if self._truth is not None:
-            self._truth.write(injected.line())
-
-    def wrap(self, device: PortDevice, name: str) -> FaultyDevice:
-        faulty = FaultyDevice(device, name, self._plan, self._note, zero_ns=self._zero_ns)
-        self.devices[name] = faulty
-        return faulty
-
-    def check_names(self) -> None:
-        """Raise `FaultPlanError` if the plan names a radar that is not there."""
-        for index, spec in enumerate(self._plan.fault):
-            for name in spec.radar:
-                if name not in self.devices:
-                    raise FaultPlanError(
-                        f"fault[{index}].radar: no radar is called {shown(name)}; "
-                        f"{choices(name, self.devices)}"
-                    )
-
-    def control(
-        self,
-        folder: Path,
-        players: Mapping[str, PlayStream] | None = None,
-        people: People | None = None,
-    ) -> ControlSocket:
-        """Open the control socket; `LinkError` if it cannot be had."""
-        path = socket_path(folder, self._cleanup, CONTROL_NAME)
-        offered = ControlSocket(path, Control(self.devices, players, people, self._zero_ns))
-        self._cleanup.callback(offered.close)
-        return offered
+def _truth_log(path: Path | None, cleanup: contextlib.ExitStack) -> Callable[[Injected], object]:
+    """Return what writes a fault to a new file as soon as it is injected; nothing without one."""
+    if path is None:
+        return lambda injected: None
+    try:
+        with waiting():
+            log = cleanup.enter_context(path.open("w", buffering=1, encoding="utf-8"))
+    except OSError as error:
+        raise LinkError(f"{path}: cannot write the truth log: {error.strerror}") from error
+    return lambda injected: log.write(injected.line())
 
 
 def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
@@ -145,12 +95,13 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         scene = empty_room(options.count) if options.bare else load_scene(options.scene)
         folder = cleanup.enter_context(link_folder(options.link_dir))
         zero_ns = time.monotonic_ns()
-        session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+        plan = _fault_plan(options.faults, [radar.name for radar in scene.radars])
+        note = _truth_log(options.truth, cleanup)
         stays = links.port_on_reset == "stay"
         asked = {"model": options.model, "firmware": options.firmware}
         changes = {"port_on_reset": "stay" if stays else "vanish"} | dict(options.option)
         changes |= {name: value for name, value in asked.items() if value is not None}
-        devices = []
+        devices, faulty_devices = [], {}
         serials = _serials(options, [radar.serial for radar in scene.radars])
         for index, (radar, serial) in enumerate(zip(scene.radars, serials, strict=True)):
             of_radar = {"model": radar.model or STOCK_MODEL}
@@ -164,7 +115,8 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                 options=device_options,
                 memory=None if state_dir is None else DirectoryMemory(state_dir, serial, warn),
             )
-            faulty = session.wrap(device, radar.name)
+            faulty = FaultyDevice(device, radar.name, plan, note, zero_ns=zero_ns)
+            faulty_devices[radar.name] = faulty
             devices.append(
                 NamedDevice(
                     name=radar.name,
@@ -175,8 +127,8 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                     uart_baud=partial(getattr, device.module, "uart_baudrate"),
                 )
             )
-        session.check_names()
-        control = session.control(folder, people=partial(people_truth, scene, seed=options.seed))
+        people = partial(people_truth, scene, seed=options.seed)
+        control = Control(faulty_devices, people=people, zero_ns=zero_ns)
         feed = None
         if not options.bare:
             feed = OdometryFeed(
@@ -219,13 +171,16 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             warn=warn,
         )
         folder = cleanup.enter_context(link_folder(options.link_dir))
-        session = FaultSession(None, None, cleanup, zero_ns=time.monotonic_ns())
-        devices = [
-            NamedDevice(name=one.name, serial=one.serial, device=session.wrap(one.device, one.name))
+        zero_ns = time.monotonic_ns()
+        faulty = {
+            one.name: FaultyDevice(one.device, one.name, FaultPlan(), zero_ns=zero_ns)
             for one in radars
+        }
+        devices = [
+            NamedDevice(name=one.name, serial=one.serial, device=faulty[one.name]) for one in radars
         ]
         players = {radar.name: radar.stream for radar in radars}
-        control = session.control(folder, players)
+        control = Control(faulty, players, zero_ns=zero_ns)
         ports = DevicePorts(devices, folder, LinkOptions(), cleanup)
         watches = [
             PortWatch(
@@ -247,13 +202,13 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         if options.wire is not None:
             capture = cleanup.enter_context(WireCapture(options.wire, {"port": options.port}))
         zero_ns = time.monotonic_ns()
-        session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+        plan = _fault_plan(options.faults, [PROXY_NAME])
+        note = _truth_log(options.truth, cleanup)
         module = ModuleLine(open_line(options.port, options.baud), capture, stop.request)
         cleanup.callback(module.close)
-        faulty = session.wrap(module, PROXY_NAME)
-        session.check_names()
+        faulty = FaultyDevice(module, PROXY_NAME, plan, note, zero_ns=zero_ns)
         folder = cleanup.enter_context(link_folder(options.link_dir))
-        control = session.control(folder)
+        control = Control({PROXY_NAME: faulty}, zero_ns=zero_ns)
         named = NamedDevice(name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present)
         ports = DevicePorts([named], folder, LinkOptions(), cleanup)
         _run(ports, control, [module], stop, cleanup, zero_ns=zero_ns)
@@ -274,7 +229,7 @@ def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
 
 def _run(
     ports: DevicePorts,
-    control: ControlSocket,
+    control: Control,
     services: Sequence[Service],
     stop: StopFlag,
     cleanup: contextlib.ExitStack,
@@ -284,15 +239,17 @@ def _run(
 ) -> None:
     if stop.requested:
         return  # do not announce ports that go away at once
+    control_socket = ControlSocket(socket_path(ports.folder, cleanup, CONTROL_NAME), control)
+    cleanup.callback(control_socket.close)
     ready = {
         "ready": True,
         "scene_time_zero_ns": zero_ns,
         "odometry": None if feed is None else os.fspath(feed.path),
-        "control": os.fspath(control.path),
+        "control": os.fspath(control_socket.path),
         "devices": ports.entries(),
     }
     feeds = [] if feed is None else [feed]
-    server = Server(ports.ports, [*feeds, *services, control, *ports.services])
+    server = Server(ports.ports, [*feeds, *services, control_socket, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed

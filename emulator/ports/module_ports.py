@@ -184,6 +184,7 @@ class DevicePorts:
         options: LinkOptions,
         cleanup: contextlib.ExitStack,
     ) -> None:
+        self.folder = folder
         self.ports: list[Port] = []
         self.services: list[Service] = []
         self.moved: Callable[[], None] = lambda: None
