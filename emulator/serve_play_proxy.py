@@ -24,8 +24,8 @@ from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.proxy import ModuleLine
 from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.runtime_folders import (
-    Announcement,
     DirectoryMemory,
+    announcement,
     keep_first_serial,
     kept_first_serial,
     link_folder,
@@ -253,9 +253,9 @@ def _run(
     cleanup.callback(server.close)
     stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
-    announcement = Announcement(ready)
-    cleanup.callback(announcement.close)
-    ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
+    announce = announcement(cleanup)
+    announce(ready)
+    ports.moved = lambda: announce({**ready, "devices": ports.entries()})
     STDOUT.write(json_text(ready, separators=(",", ":")) + "\n")
     if STDOUT.failure is not None:  # ports that were not announced are of no use
         raise LinkError(f"stdout: cannot write the ready line: {STDOUT.failure.strerror}")

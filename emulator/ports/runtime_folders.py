@@ -47,35 +47,29 @@ def _private_run_directory() -> Path | None:
     return folder if is_private(folder) else None
 
 
-class Announcement:
-    """The entry of this process, until closed.
+def announcement(cleanup: contextlib.ExitStack) -> Callable[[dict[str, Any]], None]:
+    """Return what announces a ready line in the place of the last one, until ``cleanup``.
 
     Without a usable folder nothing is announced: the ports work all the same.
     """
+    folder = _private_run_directory()
+    if folder is None:
+        return lambda ready: None
+    _remove_stale(folder)
+    path = folder / f"{os.getpid()}.json"
 
-    def __init__(self, ready: dict[str, Any]) -> None:
-        self._path: Path | None = None
-        folder = _private_run_directory()
-        if folder is None:
-            return
-        _remove_stale(folder)
-        self._path = folder / f"{os.getpid()}.json"
-        self.update(ready)
-
-    def update(self, ready: dict[str, Any]) -> None:
-        """Replace the ready line; a reader sees the old one or the new one."""
-        if self._path is None:
-            return
+    def announce(ready: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
-            fresh = self._path.with_suffix(".new")
+            fresh = path.with_suffix(".new")
             fresh.write_text(json.dumps({"pid": os.getpid(), **ready}) + "\n")
-            fresh.replace(self._path)
+            fresh.replace(path)
 
-    def close(self) -> None:
-        if self._path is not None:
-            with contextlib.suppress(OSError):
-                self._path.unlink()
-            self._path = None
+    def remove() -> None:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+    cleanup.callback(remove)
+    return announce
 
 
 def _remove_stale(folder: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 from emulator.chip import Pace
 from emulator.ports import runtime_folders
 from emulator.ports.pty import LinkError
-from emulator.ports.runtime_folders import Announcement, DirectoryMemory, fresh_port_folder
+from emulator.ports.runtime_folders import DirectoryMemory, announcement, fresh_port_folder
 from emulator.x4m300 import radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
@@ -69,13 +69,12 @@ def dead_pid() -> int:
 
 
 def test_an_announcement_is_the_ready_line_with_a_pid_until_closed(folder: Path) -> None:
-    announcement = Announcement({"ready": True, "devices": []})
-    (entry,) = folder.iterdir()
-    assert entry.name == f"{os.getpid()}.json"
-    assert json.loads(entry.read_text()) == {"pid": os.getpid(), "ready": True, "devices": []}
-    assert folder.stat().st_mode & 0o077 == 0, "nobody else's business"
-    announcement.close()
-    announcement.close()
+    with contextlib.ExitStack() as cleanup:
+        announcement(cleanup)({"ready": True, "devices": []})
+        (entry,) = folder.iterdir()
+        assert entry.name == f"{os.getpid()}.json"
+        assert json.loads(entry.read_text()) == {"pid": os.getpid(), "ready": True, "devices": []}
+        assert folder.stat().st_mode & 0o077 == 0, "nobody else's business"
     assert list(folder.iterdir()) == []
 
 
@@ -87,16 +86,17 @@ def test_what_dead_emulators_left_is_removed_and_nothing_else(folder: Path) -> N
     (folder / f"ports-{pid}-abc").mkdir()
     (folder / f"ports-{pid}-abc" / "radar_1").symlink_to("/dev/pts/99999")
     (folder / "notes.json").write_text("{}")
-    announcement = Announcement({})
-    assert sorted(path.name for path in folder.iterdir()) == sorted(
-        [f"{os.getpid()}.json", "notes.json", mine.name]
-    )
-    announcement.close()
+    with contextlib.ExitStack() as cleanup:
+        announcement(cleanup)({})
+        assert sorted(path.name for path in folder.iterdir()) == sorted(
+            [f"{os.getpid()}.json", "notes.json", mine.name]
+        )
 
 
 def test_without_a_usable_folder_nothing_is_announced(folder: Path) -> None:
     folder.write_text("a file is in the way")
-    Announcement({}).close()
+    with contextlib.ExitStack() as cleanup:
+        announcement(cleanup)({})
     assert folder.read_text() == "a file is in the way"
 
 
