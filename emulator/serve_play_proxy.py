@@ -22,7 +22,7 @@ from emulator.ports.control import Control, ControlSocket
 from emulator.ports.event_loop import Server, Service
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.proxy import ModuleLine
-from emulator.ports.pty import LinkError, PortWatch
+from emulator.ports.pty import LinkError
 from emulator.ports.runtime_folders import (
     DirectoryMemory,
     announcement,
@@ -177,22 +177,20 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             for one in radars
         }
         devices = [
-            NamedDevice(name=one.name, serial=one.serial, device=faulty[one.name]) for one in radars
+            NamedDevice(
+                name=one.name,
+                serial=one.serial,
+                device=faulty[one.name],
+                present=faulty[one.name].port_present,
+                opened=one.device.port_opened,
+                closed=one.device.port_closed,
+            )
+            for one in radars
         ]
         players = {radar.name: radar.stream for radar in radars}
         control = Control(faulty, players, zero_ns=zero_ns)
         ports = DevicePorts(devices, folder, LinkOptions(), cleanup)
-        watches = [
-            PortWatch(
-                os.fspath(folder / radar.name),
-                opened=radar.device.port_opened,
-                closed=radar.device.port_closed,
-            )
-            for radar in radars
-        ]
-        for watch in watches:
-            cleanup.callback(watch.close)
-        _run(ports, control, watches, stop, cleanup, zero_ns=time.monotonic_ns())
+        _run(ports, control, [], stop, cleanup, zero_ns=zero_ns)
 
 
 def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:

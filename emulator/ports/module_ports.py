@@ -55,73 +55,6 @@ class DeviceSide:
         return self._device.wake_ns(now_ns) if self._has_it() else None
 
 
-class Plug(Service):
-    """Takes the lines to one module away and brings them back.
-
-    Parameters
-    ----------
-    present
-        Whether the module's own port is there at a time, ns.
-    tcp
-        A client of it is hung up on, and none admitted before the module is back.
-    renames
-        Whether it returns under another name every time: NAME-2, NAME-3 and so on, so that a host
-        finds the module by its serial number only.
-    """
-
-    def __init__(
-        self,
-        link: PtyLink,
-        present: Callable[[int], bool],
-        *,
-        tcp: TcpLink | None,
-        watch: PortWatch,
-        renames: bool,
-        moved: Callable[[], None],
-    ) -> None:
-        self._link = link
-        self._present = present
-        self._tcp = tcp
-        self._watch = watch
-        self._first_path = link.path
-        self._renames = renames
-        self._returns = 0
-        self._moved = moved
-        self._selector: selectors.BaseSelector | None = None
-
-    def register(self, selector: selectors.BaseSelector) -> None:
-        self._selector = selector
-
-    def advance(self, now_ns: int) -> None:
-        wanted = self._present(now_ns)
-        if _is_open(self._link) and not wanted:
-            self._take_away()
-        elif wanted and not _is_open(self._link):
-            self._bring_back()
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        return None if _is_open(self._link) else now_ns + LOOK_AGAIN_NS
-
-    def _take_away(self) -> None:
-        if self._selector is not None:
-            wait_for(self._selector, self._link.fileno(), 0)
-        self._link.close()
-        if self._tcp is not None:
-            self._tcp.hang_up()
-
-    def _bring_back(self) -> None:
-        path = self._first_path
-        if self._renames:
-            path = path.with_name(f"{path.name}-{self._returns + 2}")
-        try:
-            self._link.reopen(path)
-        except LinkError:
-            return  # no terminal is free, or a file is in the way: look again
-        self._returns += 1
-        self._watch.follow(self._link.terminal)
-        self._moved()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedDevice:
     """A device and what the ready line says about it.
@@ -132,6 +65,9 @@ class NamedDevice:
         Scene time at which it takes the first frame of its first stream; None where unknown.
     present
         Whether its own port is there at a time, ns; None if it always is.
+    opened, closed
+        Called with the time, ns, when the first host opens its terminal, and when the last one
+        closes it or loses it.
     uart_baud
         The rate of its UART now, bit/s.
     """
@@ -141,6 +77,8 @@ class NamedDevice:
     device: ByteDevice
     start_skew_ns: int | None = None
     present: Callable[[int], bool] | None = None
+    opened: Callable[[int], None] = lambda now_ns: None
+    closed: Callable[[int], None] = lambda now_ns: None
     uart_baud: Callable[[], int] = lambda: POWER_UP_BAUD
 
 
@@ -152,7 +90,8 @@ class LinkOptions:
     ----------
     port_on_reset
         Whether a restart keeps the port, takes it away for a while, or has it return under
-        another name.
+        another name every time: NAME-2, NAME-3 and so on, so that a host finds the module by its
+        serial number only.
     tcp_base
         TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
     """
@@ -163,11 +102,32 @@ class LinkOptions:
     tcp_host: str = "127.0.0.1"
 
 
-class DevicePorts:
+@dataclass(slots=True, kw_only=True)
+class _Line:
+    """What leads to one module; ``path`` is that of its first port."""
+
+    named: NamedDevice
+    path: Path
+    link: PtyLink
+    watch: PortWatch
+    tcp: TcpLink | None
+    returns: int = 0
+
+    @property
+    def has_its_port(self) -> bool:
+        return _is_open(self.link)
+
+
+class DevicePorts(Service):
     """Everything that leads to the modules of one emulator; closed with ``cleanup``.
+
+    As a service it takes the lines to a module away with its port and brings them back. A TCP
+    client is hung up on, and none is admitted before the module is back.
 
     Attributes
     ----------
+    services
+        Those of the lines, and this one.
     moved
         Called when a port came back, maybe under another name.
 
@@ -186,70 +146,97 @@ class DevicePorts:
     ) -> None:
         self.folder = folder
         self.ports: list[Port] = []
-        self.services: list[Service] = []
+        self.services: list[Service] = [self]
         self.moved: Callable[[], None] = lambda: None
-        self._lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = []
-        self._is_uart = options.kind == "uart"
-        for index, named in enumerate(devices):
-            base = options.tcp_base
-            tcp_port = base + index if base else base
-            self._add(named, folder / named.name, tcp_port, options, cleanup)
+        self._options = options
+        self._selector: selectors.BaseSelector | None = None
+        self._lines: list[_Line] = []
+        for named in devices:
+            self._add(named, cleanup)
 
     def entries(self) -> list[dict[str, object]]:
         return [
             {
-                "name": named.name,
-                "path": os.fspath(link.path),
-                "serial": named.serial,
-                "start_skew_ns": named.start_skew_ns,
-                "tcp": None if tcp is None else tcp.port,
-                "uart": self._is_uart,
+                "name": line.named.name,
+                "path": os.fspath(line.link.path),
+                "serial": line.named.serial,
+                "start_skew_ns": line.named.start_skew_ns,
+                "tcp": None if line.tcp is None else line.tcp.port,
+                "uart": self._options.kind == "uart",
             }
-            for named, link, tcp in self._lines
+            for line in self._lines
         ]
 
-    def _add(
-        self,
-        named: NamedDevice,
-        path: Path,
-        tcp_port: int | None,
-        options: LinkOptions,
-        cleanup: contextlib.ExitStack,
-    ) -> None:
-        line = self._line(named)
-        flushed = None if line is None else line.flush_output
-        link = PtyLink(path, flushed=flushed)
+    def register(self, selector: selectors.BaseSelector) -> None:
+        self._selector = selector
+
+    def advance(self, now_ns: int) -> None:
+        for line in self._lines:
+            present = line.named.present
+            wanted = present is None or present(now_ns)
+            if line.has_its_port and not wanted:
+                self._take_away(line, now_ns)
+            elif wanted and not line.has_its_port:
+                self._bring_back(line)
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        complete = all(line.has_its_port for line in self._lines)
+        return None if complete else now_ns + LOOK_AGAIN_NS
+
+    def _take_away(self, line: _Line, now_ns: int) -> None:
+        if self._selector is not None:
+            wait_for(self._selector, line.link.fileno(), 0)
+        line.link.close()
+        line.watch.end(now_ns)
+        if line.tcp is not None:
+            line.tcp.hang_up()
+
+    def _bring_back(self, line: _Line) -> None:
+        path = line.path
+        if self._options.port_on_reset == "rename":
+            path = path.with_name(f"{path.name}-{line.returns + 2}")
+        try:
+            line.link.reopen(path)
+        except LinkError:
+            return  # no terminal is free, or a file is in the way: look again
+        line.returns += 1
+        line.watch.follow(line.link.terminal)
+        self.moved()
+
+    def _add(self, named: NamedDevice, cleanup: contextlib.ExitStack) -> None:
+        options = self._options
+        path = self.folder / named.name
+        uart = self._uart(named)
+        link = PtyLink(path, flushed=None if uart is None else uart.flush_output)
         cleanup.callback(link.close)
-        if line is not None:
-            line.host_baud = link.host_baud
-        watch = PortWatch(link.terminal, closed=lambda now_ns: link.admit())
+        if uart is not None:
+            uart.host_baud = link.host_baud
+
+        def closed(now_ns: int) -> None:
+            link.admit()
+            named.closed(now_ns)
+
+        watch = PortWatch(link.terminal, opened=named.opened, closed=closed)
         cleanup.callback(watch.close)
         self.services.append(watch)
         tcp = None
         device: ByteDevice = named.device
-        if tcp_port is not None:
+        if options.tcp_base is not None:
+            tcp_port = options.tcp_base and options.tcp_base + len(self._lines)
             tcp = TcpLink(options.tcp_host, tcp_port, admits=partial(_is_free, link, watch))
             cleanup.callback(tcp.close)
             has_client = partial(_is_open, tcp)
             device = DeviceSide(named.device, lambda: not has_client())
             guest = DeviceSide(named.device, has_client)
-            self.ports.append(Port(tcp, guest, self._line(named)))
+            self.ports.append(Port(tcp, guest, self._uart(named)))
             self.services.append(tcp)
-        self.ports.append(Port(link, device, line))
-        plug = Plug(
-            link,
-            named.present or (lambda now_ns: True),
-            tcp=tcp,
-            watch=watch,
-            renames=options.port_on_reset == "rename",
-            moved=lambda: self.moved(),
-        )
-        self.services.append(plug)
-        self._lines.append((named, link, tcp))
+        self.ports.append(Port(link, device, uart))
+        self._lines.append(_Line(named=named, path=path, link=link, watch=watch, tcp=tcp))
 
-    def _line(self, named: NamedDevice) -> UartLine | None:
+    def _uart(self, named: NamedDevice) -> UartLine | None:
         """Return a line at whose end a host has no rate of its own, as a TCP client."""
-        return UartLine(named.uart_baud, lambda: None) if self._is_uart else None
+        is_uart = self._options.kind == "uart"
+        return UartLine(named.uart_baud, lambda: None) if is_uart else None
 
 
 def _is_open(link: PtyLink | TcpLink) -> bool:

@@ -91,6 +91,13 @@ class PortWatch(Service):
             self._watch = int(ctypes.CDLL(None).inotify_add_watch(self._fd, path, mask))
         return self._watch >= 0
 
+    def end(self, now_ns: int) -> None:
+        """Note that the terminal is gone: whoever had it open has lost it."""
+        self._watch = -1
+        if self._hosts:
+            self._hosts = 0
+            self._closed(now_ns)
+
     def register(self, selector: selectors.BaseSelector) -> None:
         if self.works:
             selector.register(self._fd, selectors.EVENT_READ, self._read)

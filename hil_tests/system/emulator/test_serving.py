@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from hil_tests.bench.virtual_time import counters_of
 from hil_tests.device.emulator_process import emulator, open_radar
 from hil_tests.paths import FIXTURES
-from hil_tests.patience import seconds
+from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.full_disk import child_on_full_disk
 from xethru_protocol.cli import main
 from xethru_protocol.driver.files import FileName
@@ -278,3 +279,26 @@ def test_a_playback_is_paused_and_goes_on() -> None:
             assert done.returncode == 0, done.stderr
             (told,) = json.loads(ctl(served.paths[0], "state").stdout)["radars"].values()
             assert told["playback"]["paused"] is paused
+
+
+def test_a_playback_is_unplugged_and_begins_anew() -> None:
+    recording = FIXTURES / "recordings" / "float"
+    with emulator("play", str(recording), "--loop") as served, contextlib.ExitStack() as hosts:
+        port = Path(served.paths[0])
+
+        def is_played() -> bool:
+            (told,) = json.loads(ctl(served.paths[0], "state").stdout)["radars"].values()
+            return bool(told["playback"]["playing"])
+
+        def open_port() -> None:
+            hosts.callback(os.close, os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK))
+
+        open_port()
+        wait_until(is_played)
+        assert ctl(served.paths[0], "unplug").returncode == 0
+        wait_until(lambda: not port.is_symlink())
+        wait_until(lambda: not is_played())
+        assert ctl(served.paths[0], "plug").returncode == 0
+        wait_until(port.is_symlink)
+        open_port()
+        wait_until(is_played)
