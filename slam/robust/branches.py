@@ -516,12 +516,11 @@ class Branches:
         The robot may have been carried at ``position_m``.
         """
         rule, n_known, slip = self._rule, self._n_reported(0), self.main.slipped
-        knew_few = n_known < rule.least_landmarks and not self._is_on_map
         # Alike ranges before and behind a stop tell little where the world repeats itself.
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
 
-        def doubt(probability: float, motion_covariance: Array) -> Doubt:
+        def doubt(probability: float, motion_covariance: Array, *, knew_few: bool) -> Doubt:
             return Doubt(
                 next_id=step.next_id,
                 knew_few=knew_few,
@@ -533,8 +532,12 @@ class Branches:
 
         # An empty map begins where the robot first drives.
         is_possible = carried > 0.0 and bool(n_known or self._now)
-        carries = [doubt(carried, np.diag(rule.lost_variances))] if is_possible else []
-        slips = [] if slip is None else [doubt(1.0, slip)]
+        knew_few = n_known < rule.least_landmarks and not self._is_on_map
+        lost = np.diag(rule.lost_variances)
+        carries = [doubt(carried, lost, knew_few=knew_few)] if is_possible else []
+        # Where the map begins is unsure by a slip, too, however many landmarks follow; the
+        # covariance of the filter says so unless it has taken one of them for another.
+        slips = [] if slip is None else [doubt(1.0, slip, knew_few=False)]
         seen = None
         if self._doubts or self._slips:
             seen = seen_ranges(report, self.main.pose, rule)
@@ -566,7 +569,7 @@ class Branches:
         return kept
 
     def _is_on_few(self, doubt: Doubt) -> bool:
-        """Return whether a doubt knew too few landmarks to be confirmed, and has enough since.
+        """Return whether a carry was doubted on too few landmarks, and there are enough since.
 
         They are the map then, and the robot is sure of its place among them. Where the few and the
         start lie on it may be wrong.
