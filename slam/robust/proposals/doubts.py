@@ -126,10 +126,17 @@ class Doubt:
         return float(away @ np.linalg.solve(covariance, away)) <= float(chdtri(3, TAIL_PROBABILITY))
 
     def at(self, position_m: Array) -> Array:
-        """Return the covariance (3, 3) for a pose at a position (2,)."""
+        """Return the covariance (3, 3) for a pose at a position (2,).
+
+        A turn by an angle moves it by sin(angle) across the way from the doubt's position, of which
+        the angle is taken, and by cos(angle) - 1 along it. Of that the mean square is added.
+        """
+        away_m = position_m - self.position_m
         T = np.eye(3)
-        T[:2, 2] = quarter_turn(position_m - self.position_m)
-        return np.asarray(T @ self.covariance @ T.T)
+        T[:2, 2] = quarter_turn(away_m)
+        covariance = np.asarray(T @ self.covariance @ T.T)
+        covariance[:2, :2] += _mean_square_of_cosine(covariance[2, 2]) * np.outer(away_m, away_m)
+        return covariance
 
     def add(self, newer: Doubt) -> None:
         """Add a doubt with the same evidence; what is measured of the newer one counts."""
@@ -151,6 +158,11 @@ class Doubt:
         # The newer one's is also of landmarks that the older one did not know.
         self.information = _nothing()
         self.alike = None
+
+
+def _mean_square_of_cosine(variance: float) -> float:
+    """Return the mean of (cos(a) - 1)^2 of a normal angle a; of a small one 0.75 variance^2."""
+    return 0.5 * math.expm1(-2.0 * variance) - 2.0 * math.expm1(-variance / 2.0)
 
 
 def doubted_covariance(doubts: Sequence[Doubt], position_m: Array) -> Array:

@@ -96,10 +96,25 @@ def test_the_probabilities_of_carries_that_one_doubt_holds_add_up(n: int, each: 
     np.testing.assert_allclose(at(carries, 0.0), covered_share(min(n * each, 1.0)) * CARRY)
 
 
-def test_a_doubtful_turn_is_a_doubtful_position_far_from_it() -> None:
+def along_the_way(variance: float) -> float:
+    """Return the mean square of cos(angle) - 1 of a normal angle, by Gauss and Hermite's rule."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    return float(weights @ (np.cos(math.sqrt(variance) * nodes) - 1.0) ** 2 / weights.sum())
+
+
+@pytest.mark.parametrize("variance", [1e-4, 0.01, 0.2, 1.0])
+def test_a_doubtful_turn_is_a_doubtful_position_far_from_it(variance: float) -> None:
+    """2 m from it a place is off across the way by twice the angle, and along it by its cosine."""
+    doubt = doubtful(1.0)
+    doubt.covariance = np.diag([1e-4, 1e-4, variance])
+    along = 1e-4 + 4.0 * along_the_way(variance)
     np.testing.assert_allclose(
-        at(doubtful(1.0), 3.0),
-        [[1e-4, 0.0, 0.0], [0.0, 1e-4 + 4.0 * 0.01, 2.0 * 0.01], [0.0, 0.02, 0.01]],
+        at(doubt, 3.0),
+        [
+            [along, 0.0, 0.0],
+            [0.0, 1e-4 + 4.0 * variance, 2.0 * variance],
+            [0.0, 2.0 * variance, variance],
+        ],
     )
 
 
@@ -107,9 +122,11 @@ def test_a_carry_from_one_of_two_places_has_the_mean_of_both() -> None:
     both = doubtful(0.0)
     both.add(doubtful(1.0))
     sums = np.array([[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]])
-    np.testing.assert_allclose(at(both, 3.0), sums / 2.0)
+    along = np.diag([along_the_way(0.01) + 4.0 * along_the_way(0.02), 0.0, 0.0])
+    np.testing.assert_allclose(at(both, 3.0), (sums + along) / 2.0)
     apart = doubted_covariance([doubtful(0.0), doubtful(1.0)], np.array([3.0, 0.0]))
-    np.testing.assert_allclose(apart, sums / 2.0)
+    along = np.diag([(9.0 + 4.0) * along_the_way(0.01), 0.0, 0.0])
+    np.testing.assert_allclose(apart, (sums + along) / 2.0)
 
 
 def test_doubts_that_are_joined_need_what_both_need() -> None:

@@ -459,8 +459,7 @@ def test_a_filter_that_is_sure_behind_a_slip_leaves_it_in_doubt(run: Run) -> Non
 def test_a_slip_before_any_landmark_stays_in_doubt_whatever_is_mapped_since(run: Run) -> None:
     """The place where the map begins is unsure by it for good."""
     branches, end = Branches(paper_rig(), parameters_for(LAB, SIGMA_M)), 160
-    scans = [[]] * 23 + run.scans[23:end]
-    for _ in follow(branches, slipped(run, 20)[:end], scans):
+    for _ in follow(branches, slipped(run, 20)[:end], [[]] * 23 + run.scans[23:end]):
         pass
     assert branches.main.n_reported_since(0) >= BranchRule().least_landmarks
     branches.main.state.set_pose(branches.main.pose, 1e-8 * np.eye(3))
