@@ -1075,7 +1075,8 @@ class RobustBackEnd:
         """
         state, pairs = self.state, tuple(pairs)
         ids = named_pairs(state, pairs)
-        found = solved_as_one(self._log, state, pairs, self.parameters)
+        named = self._landmark_of_label.values()
+        found = solved_as_one(self._log, state, pairs, self.parameters, named)
         if found is None:
             self._refused[ids] = self._n_updates
             return False

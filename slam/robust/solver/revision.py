@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from slam.geometry import align_se2, transform, wrap_angle
@@ -123,9 +124,15 @@ class _Trial:
 
     two: Problem
     one: Problem
+    left_out: Indices  # shape (k,): rows of the log's ranges that are in neither
     pairs: Pairs
     most_rise: float  # of the cost, from two to one
     parameters: BackEndParameters
+
+    def merged(self, together: Solution | None) -> Merged | None:
+        if together is None:
+            return None
+        return Merged(problem=self.one, solution=together, left_out=self.left_out)
 
     def allows(self, together: Solution, least: float) -> bool:
         """Return whether a solution with them as one is good enough; ``least`` is that as two."""
@@ -153,7 +160,11 @@ class _Trial:
 
 
 def solved_as_one(
-    log: RunLog, state: State, pairs: Pairs, parameters: BackEndParameters
+    log: RunLog,
+    state: State,
+    pairs: Pairs,
+    parameters: BackEndParameters,
+    known_ids: Collection[int] = (),
 ) -> Merged | None:
     """Solve for the whole run with landmarks, by row, as one, in pairs.
 
@@ -163,64 +174,76 @@ def solved_as_one(
     one. The cost may rise by what chance explains, the quantile of chi-square with two degrees of
     freedom for each pair, and most ranges of each landmark must fit where it is then.
 
-    Behind a slip the robot may have taken one thing for another. So if all that fails, passages
-    that are far off where the loop is closed are left out of both solutions. Each landmark that
-    they were taken for costs as much as one may say against a place.
+    Behind a slip the robot may have taken one thing for another. So if all that fails, and there
+    are as many pairs as place a robot, mistaken passages are left out of both solutions. Each
+    landmark that they were taken for costs `BranchRule.most_against`. Landmarks of ``known_ids``
+    are known for certain whenever they are seen.
     """
-    ids = state.landmark_ids
+    ids, rule = state.landmark_ids, parameters.branches
     same = {ids[gone]: ids[kept] for kept, gone in pairs}
     two, one = copy.copy(state), copy.deepcopy(state)
     two.added_sigmas_m = state.added_sigmas_m | noisier(state, same)
     one.added_sigmas_m |= noisier(state, same)
     apply_merge(one, pairs, MERGE_SIGMA_M)
+    by_chance = float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
 
-    def trial(left_out: Indices, n_mistaken: int = 0) -> _Trial:
+    def trial(left_out: Indices, most_rise: float) -> _Trial:
         return _Trial(
             two=log.problem(two, parameters, without=left_out),
             one=log.problem(one, parameters, same, left_out),
+            left_out=left_out,
             pairs=pairs,
-            most_rise=float(chdtri(2 * len(pairs), TAIL_PROBABILITY))
-            - 2.0 * parameters.branches.most_against * n_mistaken,
+            most_rise=most_rise,
             parameters=parameters,
         )
 
-    nothing = np.zeros(0, dtype=np.intp)
-    every = trial(nothing)
+    every = trial(np.zeros(0, dtype=np.intp), by_chance)
     apart = _solved(log, two, every.two, parameters)
     if apart is None:
         return None
     # Most pairs are near enough to be solved for from where the filter has them.
     together = _solved(log, one, every.one, parameters)
     if together is not None and every.allows(together, apart.cost):
-        return Merged(problem=every.one, solution=together, left_out=nothing)
+        return every.merged(together)
     closed = with_closed_loop(every.two, apart.estimate, pairs)
     together = every.solved_from(closed, apart.cost)
-    if together is not None:
-        return Merged(problem=every.one, solution=together, left_out=nothing)
+    if together is not None or len(pairs) < rule.least_landmarks:
+        return every.merged(together)
     rows, passages = log.passages(one, same)
-    off = far_off(every.one, closed, passages, parameters.relinearisation.outlier_sigmas)
-    is_off = np.isin(passages, off)
-    left_out = rows[is_off]
-    some = trial(left_out, len(np.unique(every.one.range_landmarks[is_off])))
-    if not len(off) or some.most_rise <= 0.0:
+    is_certain = np.isin(one.feature_ids, [*same.values(), *known_ids])
+    limit = parameters.relinearisation.outlier_sigmas
+    is_mistaken = mistaken(every.one, closed, passages, is_certain, limit)
+    n_mistaken = len(np.unique(every.one.range_landmarks[is_mistaken]))
+    most_rise = by_chance - 2.0 * rule.most_against * n_mistaken
+    if not n_mistaken or most_rise <= 0.0:
         return None
+    some = trial(rows[is_mistaken], most_rise)
     again = Smoother(some.two, parameters.relinearisation).solve(apart.estimate)
-    together = None if again is None else some.solved_from(closed, again.cost)
-    if together is None:
-        return None
-    return Merged(problem=some.one, solution=together, left_out=left_out)
+    return None if again is None else some.merged(some.solved_from(closed, again.cost))
 
 
-def far_off(
-    problem: Problem, estimate: Estimate, passages: Indices, outlier_sigmas: float
-) -> Indices:
-    """Return the passages most ranges of which are too far off to be solved for, shape (k,).
+def mistaken(
+    problem: Problem,
+    closed: Estimate,
+    passages: Indices,
+    is_certain: NDArray[np.bool_],
+    outlier_sigmas: float,
+) -> NDArray[np.bool_]:
+    """Return which ranges are of passages in which something was taken for a landmark, (m,).
 
-    ``passages`` (m,) are those of the ranges.
+    Most ranges of such a passage are too far off where the loop is closed to be solved for. It is
+    not the first one of the landmark, which says what the landmark is, and not of one that
+    ``is_certain`` (n,), by row. ``passages`` (m,) are those of the ranges.
     """
-    residual = measurement_residuals(problem, estimate).residual[: len(passages)]
+    residual = measurement_residuals(problem, closed).residual[: len(passages)]
     is_far = np.abs(residual) > SECOND_NOISE_FACTOR * outlier_sigmas
-    return np.flatnonzero(np.bincount(passages, is_far) > 0.5 * np.bincount(passages))
+    are_mistaken = np.bincount(passages, is_far) > 0.5 * np.bincount(passages)
+    of_range = problem.range_landmarks
+    # Passages are numbered by landmark, and those of one in the order of time.
+    first = np.full(len(is_certain), len(passages))
+    np.minimum.at(first, of_range, passages)
+    are_mistaken[first[np.unique(of_range)]] = False
+    return are_mistaken[passages] & ~is_certain[of_range]
 
 
 def with_closed_loop(problem: Problem, apart: Estimate, pairs: Pairs) -> Estimate:

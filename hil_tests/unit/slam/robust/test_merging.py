@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
@@ -166,23 +167,52 @@ def test_a_map_that_is_met_again_behind_a_large_slip_is_one(hidden_rad: float) -
     assert_is_at(back_end, pose)
 
 
-@pytest.mark.parametrize(("hidden_rad", "twin"), [(0.6, 2), (1.0, 0)])
-def test_a_thing_that_was_taken_for_another_one_behind_a_slip_does_not_keep_a_loop_open(
+def mistaken_behind_a_slip(
     hidden_rad: float, twin: int
-) -> None:
-    """It lies where the slip carries the other one; its ranges are of nothing then."""
+) -> tuple[RobustBackEnd, Array, list[tuple[int, int]], NDArray[np.intp]]:
+    """Return what `met_again` returns, and the rows of ranges of a thing taken for another one."""
     back_end, pose, pairs, (known, other) = met_again(np.array([0.05, -0.03, hidden_rad]), twin)
     state, ranges = back_end.state, back_end._log._ranges.rows_to_write()
     names = [state.landmark_ids[row] for row in (known, other)]
     wrong = np.flatnonzero(ranges["landmark"] == names[1])
     ranges["landmark"][wrong] = names[0]
     state.remove(other)
-    pairs = [(kept, gone - (gone > other)) for kept, gone in pairs]
+    return back_end, pose, [(kept, gone - (gone > other)) for kept, gone in pairs], wrong
+
+
+@pytest.mark.parametrize(("hidden_rad", "twin"), [(0.6, 2), (1.0, 0)])
+def test_a_thing_that_was_taken_for_another_one_behind_a_slip_does_not_keep_a_loop_open(
+    hidden_rad: float, twin: int
+) -> None:
+    """It lies where the slip carries the other one; its ranges are of nothing then."""
+    back_end, pose, pairs, wrong = mistaken_behind_a_slip(hidden_rad, twin)
     assert back_end.merge_if_possible(pairs)
     assert_is_at(back_end, pose)
     left_out = back_end._log._ranges.rows["landmark"] < 0
     assert np.all(left_out[wrong])
     assert np.count_nonzero(left_out) == len(wrong)
+
+
+@pytest.mark.parametrize("why", ["two pairs", "the price", "a label", "other pairs"])
+def test_a_loop_stays_open_if_a_mistake_explains_it_no_better(why: str) -> None:
+    back_end, _, pairs, wrong = mistaken_behind_a_slip(0.6, 2)
+    log, rules = back_end._log, back_end.parameters
+    id_ = int(log._ranges.rows["landmark"][wrong[0]])
+    if why == "two pairs":
+        pairs = pairs[:2]
+    elif why == "the price":
+        dear = replace(rules.branches, most_against=100.0)
+        back_end.parameters = replace(rules, branches=dear)
+    elif why == "a label":
+        back_end._landmark_of_label[7] = id_
+    else:
+        pairs = [
+            (kept, gone) for (kept, _), (_, gone) in zip(pairs, pairs[1:] + pairs[:1], strict=True)
+        ]
+    before = back_end.state.landmarks_m.copy()
+    assert not back_end.merge_if_possible(pairs)
+    assert np.array_equal(back_end.state.landmarks_m, before)
+    assert not np.any(log._ranges.rows["landmark"] < 0)
 
 
 @pytest.mark.parametrize("apart_m", [0.1, 0.15, 0.3])

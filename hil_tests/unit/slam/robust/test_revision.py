@@ -12,7 +12,7 @@ from slam.config import WheelNoise
 from slam.geometry import between, compose, transform
 from slam.robust.parameters import SECOND_NOISE_FACTOR, BackEndParameters
 from slam.robust.solver import revision
-from slam.robust.solver.revision import far_off, with_closed_loop, with_doubled
+from slam.robust.solver.revision import mistaken, with_closed_loop, with_doubled
 from slam.robust.solver.run_log import Estimate, Problem, RunLog
 from slam.robust.solver.smoother import Eliminated, Solution
 from slam.robust.state import Layout, State
@@ -161,31 +161,47 @@ def test_passages_of_one_landmark_are_more_than_the_gap_apart() -> None:
     assert log.passages(state, {gone: second})[0].tolist() == [0, 2, 4, 6]
 
 
-def test_a_passage_is_far_off_if_most_of_its_ranges_are() -> None:
-    """They are taken from the origin, of landmarks at 1 m, with standard deviations of 1 mm."""
-    layout = Layout(N_RADARS, 2, 0, has_radii=False)
-    rows = np.repeat([0, 0, 1], [4, 3, 4])
-    passages = np.repeat([0, 1, 2], [4, 3, 4])
+@pytest.mark.parametrize(
+    ("n_off", "is_certain", "expected"),
+    [
+        # Ranges too far off of four, passage by passage; of two landmarks, each with two passages
+        ((0, 3, 0, 2), (False, False), [1]),
+        ((0, 4, 0, 3), (False, False), [1, 3]),
+        ((0, 4, 0, 3), (True, False), [3]),
+        # The first passage says what a landmark is
+        ((4, 0, 4, 4), (False, False), [3]),
+    ],
+    ids=["most of one", "both", "one is certain", "first ones"],
+)
+def test_a_passage_is_mistaken_if_most_of_its_ranges_are_too_far_off(
+    n_off: tuple[int, ...], is_certain: tuple[bool, bool], expected: list[int]
+) -> None:
+    """Ranges are taken from the origin, of landmarks at 1 m, with deviations of 1 mm."""
+    passages = np.repeat([0, 1, 2, 3], 4)
+    rows, values = passages // 2, np.zeros(16)
+    is_far = np.concatenate([np.arange(4) < n for n in n_off])
     limit_m = 4e-3 * SECOND_NOISE_FACTOR
-    off_m = limit_m * np.array([1.1, 1.1, -1.1, 0.9, 1.1, 0.9, 0.0, 1.1, 1.1, 0.9, 0.9])
-    problem, apart, _ = bent_run(0.1, 0.1)
-    values = np.zeros(len(rows))
+    off_m = limit_m * np.where(is_far, 1.1, 0.9) * np.tile([1.0, -1.0], 8)
+    bent, apart, _ = bent_run(0.1, 0.1)
     problem = replace(
-        problem,
-        layout=layout,
-        range_poses=np.zeros(len(rows), dtype=np.intp),
-        range_radars=np.zeros(len(rows), dtype=np.intp),
+        bent,
+        layout=Layout(N_RADARS, 2, 0, has_radii=False),
+        range_poses=np.zeros(16, dtype=np.intp),
+        range_radars=np.zeros(16, dtype=np.intp),
         range_landmarks=rows,
-        range_antennas=np.zeros((len(rows), 2)),
+        range_antennas=np.zeros((16, 2)),
         range_turns=values,
         ranges_m=1.0 + off_m,
         range_sigmas_m=values + 1e-3,
-        range_bearings_rad=np.full(len(rows), math.nan),
-        range_bearing_sigmas_rad=np.full(len(rows), math.nan),
+        range_bearings_rad=np.full(16, math.nan),
+        range_bearing_sigmas_rad=np.full(16, math.nan),
     )
     fixed = np.concatenate([np.zeros(N_RADARS), [1.0, 0.0], [0.0, 1.0]])
-    estimate = replace(apart, poses=np.zeros_like(apart.poses), fixed=fixed)
-    assert far_off(problem, estimate, passages, outlier_sigmas=4.0).tolist() == [0]
+    closed = replace(apart, poses=np.zeros_like(apart.poses), fixed=fixed)
+    shuffled = np.random.default_rng(0).permutation(16)
+    problem = replace(problem, ranges_m=problem.ranges_m[shuffled], range_landmarks=rows[shuffled])
+    found = mistaken(problem, closed, passages[shuffled], np.array(is_certain), outlier_sigmas=4.0)
+    np.testing.assert_array_equal(found, np.isin(passages[shuffled], expected))
 
 
 # The final pose [m, m, rad] and the cost of the solution from each start; the pose before it is
