@@ -289,29 +289,17 @@ def _safe_mode(probe: PortProbe) -> str | None:
 
 
 @_port_check(
-    "has profiles",
-    looks_at="order code and firmware id",
-    remedy="nothing, for raw radar; an X4M200 or X4M300 gets its profiles with its sensor firmware",
-    level=Level.NOTE,
-)
-def _bare_xep(probe: PortProbe) -> str | None:
-    if not probe.is_bare_xep:
-        return None
-    name = probe.info.firmware_id or "XEP"
-    return f"bare {name} firmware, as on an X4M03 or X4M05: raw frames, no profiles"
-
-
-@_port_check(
     "is an X4M300",
-    looks_at="order code",
-    remedy="raw frames work alike; presence needs an X4M300",
+    looks_at="order code and firmware id",
+    remedy="raw frames work alike; presence needs an X4M300 with its sensor firmware",
     level=Level.NOTE,
 )
 def _other_product(probe: PortProbe) -> str | None:
+    if probe.is_bare_xep:
+        name = probe.info.firmware_id or "XEP"
+        return f"bare {name} firmware, as on an X4M03 or X4M05: raw frames, no profiles"
     code = probe.info.order_code
-    if probe.is_bare_xep or code == "X4M300":
-        return None
-    return f"it is an {code}, not an X4M300"
+    return None if code == "X4M300" else f"it is an {code}, not an X4M300"
 
 
 @_port_check(
@@ -349,32 +337,6 @@ def _wrong_profile(probe: PortProbe) -> str | None:
     if loaded is None or loaded in (ProfileId.XTS_ID_APP_NONE, ProfileId.XTS_ID_APP_PRESENCE_2):
         return None
     return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
-
-
-@_port_check(
-    "profile loaded",
-    looks_at="GET_PROFILEID",
-    remedy="nothing, for raw radar; for presence, load and start PRESENCE_2 with "
-    "xethru record --profile presence",
-    level=Level.NOTE,
-)
-def _no_profile(probe: PortProbe) -> str | None:
-    if probe.profile_id == ProfileId.XTS_ID_APP_NONE:
-        return f"no profile is loaded (mode {probe.info.mode}); raw programs leave it so"
-    return None
-
-
-@_port_check(
-    "radar runs",
-    looks_at="the mode",
-    remedy="start it: xethru stream --port {path}",
-    level=Level.NOTE,
-)
-def _stopped(probe: PortProbe) -> str | None:
-    paused = (SensorMode.XTID_SM_IDLE.label, SensorMode.XTID_SM_STOP.label)
-    if probe.profile_id != ProfileId.XTS_ID_APP_NONE and probe.info.mode in paused:
-        return f"the radar stands still (mode {probe.info.mode})"
-    return None
 
 
 @_port_check(

@@ -113,19 +113,9 @@ MODULES = [
     ("is a module", lambda: PtyModule(stock(pong=0x12345678)), "fault", "0x12345678"),
     ("ready", lambda: PtyModule(stock(pong=NOT_READY)), "fault", "not ready"),
     ("not in safe mode", lambda: PtyModule(stock(pong=SAFE_MODE)), "fault", "safe mode"),
-    (
-        "has profiles",
-        lambda: PtyModule(
-            stock(order_code=None, firmware_id="XEP", version="3.4.8", mode=None, profile=None)
-        ),
-        "note",
-        "bare XEP firmware",
-    ),
     ("is an X4M300", lambda: PtyModule(stock(order_code="X4M200")), "note", "X4M200"),
     ("firmware", lambda: PtyModule(stock(version="1.5.10")), "fault", "lacks DELETE_NOISEMAP"),
     ("right profile", lambda: PtyModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
-    ("profile loaded", lambda: PtyModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
-    ("radar runs", lambda: PtyModule(stock(mode=IDLE)), "note", "mode IDLE"),
     ("transmitter on", lambda: PtyModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
 ]
 SILENT = {"not in the bootloader", "speaks XeThru", "listens", "answers"}
@@ -163,30 +153,38 @@ def test_what_is_wrong_with_a_module(
     assert word in finding["found"]
 
 
+BARE_XEP = partial(stock, firmware_id="XEP", version="3.4.8")
+
+
 @pytest.mark.parametrize(
-    ("make", "check"),
+    ("make", "word"),
     [
-        (
-            partial(
-                stock,
-                order_code="X4M03",
-                firmware_id="XEP",
-                version="3.4.8",
-                mode=None,
-                profile=None,
-            ),
-            "has profiles",
-        ),
-        (partial(stock, order_code="X4M05", firmware_id="XEP", version="3.4.8"), "has profiles"),
-        (partial(stock, order_code="X4M200", profile=0x064E57AD), "is an X4M300"),
+        (partial(BARE_XEP, order_code=None, mode=None, profile=None), "bare XEP firmware"),
+        (partial(BARE_XEP, order_code="X4M03", mode=None, profile=None), "bare XEP firmware"),
+        (partial(BARE_XEP, order_code="X4M05"), "bare XEP firmware"),
+        (partial(stock, order_code="X4M200", profile=0x064E57AD), "X4M200"),
     ],
 )
 def test_other_products_have_no_faults(
-    make: Callable[[], Answer], check: str, capsys: Capture
+    make: Callable[[], Answer], word: str, capsys: Capture
 ) -> None:
     with PtyModule(make()) as module:
         code, finding = only_finding(capsys, module.path)
-    assert (code, finding["check"], finding["level"]) == (0, check, "note")
+    assert (code, finding["check"], finding["level"]) == (0, "is an X4M300", "note")
+    assert word in finding["found"]
+
+
+@pytest.mark.parametrize(
+    ("make", "mode"),
+    [(partial(stock, mode=STOP, profile=0), "STOP"), (partial(stock, mode=IDLE), "IDLE")],
+)
+def test_a_module_that_stands_still_is_well(
+    make: Callable[[], Answer], mode: str, capsys: Capture
+) -> None:
+    with PtyModule(make()) as module:
+        code, (report,) = examined(capsys, "--port", module.path)
+    assert (code, not_well(report)) == (0, [])
+    assert f"mode {mode}" in report["about"]
 
 
 @pytest.mark.usefixtures("hurried")
