@@ -2,11 +2,9 @@
 
 import argparse
 import builtins
-import re
 import signal
 import sys
 import threading
-import traceback
 from collections.abc import Collection
 from pathlib import Path
 from types import CodeType, ModuleType, TracebackType
@@ -19,16 +17,6 @@ from xethru_protocol.wire.errors import XeThruError
 _OURS = str(Path(xethru_protocol.__file__).parent)
 _INTERRUPTED = 130
 
-# What Python 3 says of statements of Python 2, and such statements where it says no more than
-# "invalid syntax".
-_MESSAGES_OF_PYTHON_2 = re.compile(
-    r"Missing parentheses in call to|multiple exception types must be parenthesized"
-    r"|leading zeros in decimal integer|inconsistent use of tabs|invalid decimal literal"
-)
-_STATEMENTS_OF_PYTHON_2 = re.compile(
-    r"^\s*(print|exec)\s+[^=(]|^\s*except\s+[\w.]+\s*,|^\s*raise\s+[\w.]+\s*,|<>|`|\bur?['\"]|\d[lL]\b"
-)
-
 
 class _ScriptError(XeThruError):
     """A script cannot be read or compiled."""
@@ -37,8 +25,6 @@ class _ScriptError(XeThruError):
 def legacy(arguments: argparse.Namespace) -> int:
     path = Path(arguments.script)
     code = _compiled(path)
-    if code is None:
-        return 1
     main = ModuleType("__main__")
     vars(main).update(__file__=str(path), __builtins__=builtins)
     running = threading.enumerate()
@@ -69,32 +55,20 @@ def legacy(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _compiled(path: Path) -> CodeType | None:
-    """Compile a script; None if it is not Python 3 and its error was shown."""
+def _compiled(path: Path) -> CodeType:
     try:
         source = path.read_bytes()
     except OSError as error:
         raise _ScriptError(f"{path} cannot be read: {error.strerror or error}") from None
     try:
         return compile(source, str(path), "exec", dont_inherit=True)
-    except SyntaxError as error:
-        if _is_python_2(error):
-            raise _ScriptError(
-                f"{path} is Python 2 ({error.msg}, line {error.lineno}): convert it, by "
-                f"'2to3 -w {path.name}' of a Python before 3.13, or 'futurize -w {path.name}' of "
-                "the package future, and run the result"
-            ) from None
-        traceback.print_exception(error, limit=0)
-    except (ValueError, RecursionError, MemoryError) as error:  # null bytes, or nested too deeply
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = str(error) or "it is nested too deeply"
-        raise _ScriptError(f"{path} is not a Python script: {reason}") from None
-    return None
-
-
-def _is_python_2(error: SyntaxError) -> bool:
-    return bool(
-        _MESSAGES_OF_PYTHON_2.search(error.msg) or _STATEMENTS_OF_PYTHON_2.search(error.text or "")
-    )
+        raise _ScriptError(
+            f"{path} is not Python 3: {reason}; if it is Python 2, convert it by "
+            f"'2to3 -w {path.name}' of a Python before 3.13, or 'futurize -w {path.name}' of the "
+            "package future"
+        ) from None
 
 
 def _join_threads(others: Collection[threading.Thread]) -> None:

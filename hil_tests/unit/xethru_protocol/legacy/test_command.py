@@ -137,38 +137,17 @@ def test_scripts_catch_errors_of_modules_as_runtime_errors(
 
 
 @pytest.mark.parametrize(
-    "statement",
-    [
-        "print 'text'",
-        "print frame",
-        "try: pass\nexcept ValueError, error: pass",
-        "raise ValueError, 'text'",
-        "exec 'x = 1'",
-        "mode = 0777",
-        "big = 10L",
-        "x = `1`",
-        "if 1 <> 2: pass",
-        "if True:\n        x = 1\n\ty = 2",
-    ],
+    ("text", "place"),
+    [("import sys\nprint 'text'\n", "line 2"), ("if 1:\n        x = 1\n\ty = 2\n", "line 3")],
 )
-def test_python_2_is_named_with_what_converts_it(
-    statement: str, script: Script, capsys: pytest.CaptureFixture[str]
+def test_a_syntax_error_is_named_with_what_converts_python_2(
+    text: str, place: str, script: Script, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert script(f"import sys\n{statement}\n") == 1
+    assert script(text) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is Python 2" in line
+    assert f"old.py, {place}" in line
     assert "2to3" in line
     assert "futurize" in line
-
-
-def test_another_syntax_error_is_shown_as_python_does(
-    script: Script, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script("x = (1,\n") == 1
-    shown = capsys.readouterr().err
-    assert 'old.py", line 1' in shown
-    assert "Python 2" not in shown
-    assert shown.splitlines()[-1].startswith("SyntaxError: ")
 
 
 def test_what_is_no_script_gets_one_line(
