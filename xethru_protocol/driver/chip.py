@@ -37,7 +37,7 @@ from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, RemoteP
 V = TypeVar("V")
 RegisterSpace = Literal["spi", "pif", "xif"]
 
-_SPACES: Final[dict[str, X4Setting]] = {
+REGISTER_SPACES: Final[dict[RegisterSpace, X4Setting]] = {
     "spi": X4Setting.SPIREGISTER,
     "pif": X4Setting.PIFREGISTER,
     "xif": X4Setting.XIFREGISTER,
@@ -297,7 +297,14 @@ class X4(Part[KindT]):
     @sends
     def settings(link: Link) -> Steps[dict[X4Setting, m.X4Value | None]]:
         """Read every setting that has a getter; None where the module refuses."""
-        return link.x4_settings()
+        values: dict[X4Setting, m.X4Value | None] = {}
+        for setting in X4Setting:
+            if setting not in m.REGISTERS | {X4Setting.ENABLE}:  # which have no getter
+                try:
+                    values[setting] = yield from link.x4_get(setting)
+                except DeviceError:
+                    values[setting] = None
+        return values
 
 
 class Postprocessing(Part[KindT]):
@@ -348,22 +355,21 @@ class Registers(Part[KindT]):
     @sends
     def read(link: Link, space: RegisterSpace, address: int) -> Steps[int]:
         """Read one register, 0 ... 255, of the space ``"spi"``, ``"pif"`` or ``"xif"``."""
-        command = m.X4DriverGet(setting=_space(space), address=_byte("address", address))
+        command = m.X4DriverGet(setting=_space(space), address=address)
         (value,) = yield from link.numbers(command, 1)
         return int(value)
 
     @sends
     def write(link: Link, space: RegisterSpace, address: int, value: int) -> Steps[None]:
         """Write one register, 0 ... 255."""
-        wanted = (_byte("address", address), _byte("value", value))
-        yield from link.request(m.X4DriverSet(setting=_space(space), value=wanted))
+        yield from link.request(m.X4DriverSet(setting=_space(space), value=(address, value)))
 
     @sends
     def read_burst(link: Link, address: int, length: int) -> Steps[bytes]:
         """Read 1 ... 6143 bytes, all from the one SPI register, such as the frame FIFO's."""
         if not 1 <= length <= _LONGEST_READ:
             raise LocalProtocolError(f"a burst reads 1 ... {_LONGEST_READ} bytes, not {length}")
-        command = m.X4DriverRead(address=_byte("address", address), length=length)
+        command = m.X4DriverRead(address=address, length=length)
         return (yield from link.request(command)).values
 
     @sends
@@ -373,7 +379,7 @@ class Registers(Part[KindT]):
             raise LocalProtocolError(
                 f"a burst writes 1 ... {_LONGEST_WRITE} bytes, not {len(data)}"
             )
-        command = m.X4DriverWrite(address=_byte("address", address), values=bytes(data))
+        command = m.X4DriverWrite(address=address, values=bytes(data))
         yield from link.request(command)
 
     @sends
@@ -384,17 +390,12 @@ class Registers(Part[KindT]):
     @sends
     def write_i2c(link: Link, address: int, data: bytes) -> Steps[None]:
         """Write bytes to the I2C register ``address``; newer sensor firmware (16)."""
-        command = m.X4DriverWriteI2c(address=_byte("address", address), values=bytes(data))
+        command = m.X4DriverWriteI2c(address=address, values=bytes(data))
         yield from link.request(command)
 
 
-def _space(name: str) -> X4Setting:
-    if name not in _SPACES:
-        raise LocalProtocolError(f"registers lie in {', '.join(_SPACES)}, not in {shown(name)}")
-    return _SPACES[name]
-
-
-def _byte(what: str, value: int) -> int:
-    if not 0 <= value <= 255:
-        raise LocalProtocolError(f"a register's {what} is 0 ... 255, not {value}")
-    return value
+def _space(name: RegisterSpace) -> X4Setting:
+    if name not in REGISTER_SPACES:
+        spaces = ", ".join(REGISTER_SPACES)
+        raise LocalProtocolError(f"registers lie in {spaces}, not in {shown(name)}")
+    return REGISTER_SPACES[name]

@@ -609,16 +609,6 @@ class Link:
                     f"{self.name} has {firmware.name}: update it"
                 )
 
-    def x4_settings(self) -> Steps[dict[X4Setting, m.X4Value | None]]:
-        values: dict[X4Setting, m.X4Value | None] = {}
-        for setting in X4Setting:
-            if setting not in m.REGISTERS | {X4Setting.ENABLE}:  # which have no getter
-                try:
-                    values[setting] = yield from self.x4_get(setting)
-                except DeviceError:
-                    values[setting] = None
-        return values
-
     def x4_get(self, setting: X4Setting) -> Steps[m.X4Value]:
         """Read one X4 setting: a number, or the two ends of the frame area."""
         reply = yield from self.request(m.X4DriverGet(setting=setting))

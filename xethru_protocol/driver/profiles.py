@@ -13,12 +13,12 @@
 """
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S, KindT, Link, Part, Steps, receives, sends
-from xethru_protocol.driver.matching import FRAMES
+from xethru_protocol.driver.matching import FRAMES, summary
 from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
@@ -109,7 +109,7 @@ class Profile(Part[KindT]):
         yield from _load(link, profile_id)
         link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
         waiting = keep_messages(link)
-        texts = _texts(waiting)
+        texts = [message for message in waiting if isinstance(message, m.DataString)]
         waiting.clear()  # those that wait are of what ran before
         waiting.extend(texts)
 
@@ -163,7 +163,7 @@ class Profile(Part[KindT]):
 
     @sends
     def sensitivity(link: Link) -> Steps[int]:
-        return _setting(link, m.GetSensitivity(), "sensitivity")
+        return _setting(link, m.GetSensitivity())
 
     @sends
     def set_band(link: Link, tx_center_frequency: int) -> Steps[None]:
@@ -175,7 +175,7 @@ class Profile(Part[KindT]):
     @sends
     def band(link: Link) -> Steps[int]:
         """Ask for the band, 3 or 4."""
-        return _setting(link, m.GetTxCenterFrequency(), "band")
+        return _setting(link, m.GetTxCenterFrequency())
 
     @sends
     def set_led(link: Link, mode: LedMode, intensity: int = 0) -> Steps[None]:
@@ -184,7 +184,7 @@ class Profile(Part[KindT]):
 
     @sends
     def led(link: Link) -> Steps[LedMode]:
-        value = yield from _setting(link, m.AppGetLedControl(), "LED mode")
+        value = yield from _setting(link, m.AppGetLedControl())
         try:
             return LedMode(value)
         except ValueError:
@@ -199,7 +199,7 @@ class Profile(Part[KindT]):
 
     @sends
     def noise_map(link: Link) -> Steps[NoiseMapControl]:
-        value = yield from _setting(link, m.NoiseMapGetControl(), "noise map control")
+        value = yield from _setting(link, m.NoiseMapGetControl())
         return NoiseMapControl(value)
 
     @sends
@@ -210,7 +210,7 @@ class Profile(Part[KindT]):
     @sends
     def noise_map_interval(link: Link) -> Steps[int]:
         """Ask how often the noise map is stored [min]."""
-        return _setting(link, m.NoiseMapGetPeriodicStore(), "noise map interval")
+        return _setting(link, m.NoiseMapGetPeriodicStore())
 
     @sends
     def store_noise_map(link: Link) -> Steps[None]:
@@ -369,7 +369,7 @@ def _load(link: Link, profile_id: int) -> Steps[None]:
 
 
 def _profile_id(link: Link) -> Steps[int]:
-    return (yield from _value(link, m.GetProfileId(), "profile")) & 0xFFFFFFFF
+    return (yield from _value(link, m.GetProfileId())) & 0xFFFFFFFF
 
 
 def _zone_limits(link: Link) -> Steps[ZoneLimits]:
@@ -385,8 +385,7 @@ def _zone(link: Link) -> Steps[tuple[float, float]]:
 
 
 def _output(link: Link, question: m.OutputGetControl | m.DebugOutputGetControl) -> Steps[int]:
-    what = f"control of output {question.feature:08X}h"
-    return (yield from _setting(link, question, what)) & 0xFFFFFFFF
+    return (yield from _setting(link, question)) & 0xFFFFFFFF
 
 
 # --- modes and messages -------------------------------------------------------------------------
@@ -439,10 +438,6 @@ def _waiting(link: Link, kind: type[m.Response]) -> deque[m.Response]:
     return keep_messages(link)
 
 
-def _texts(messages: Iterable[m.Response]) -> list[m.DataString]:
-    return [message for message in messages if isinstance(message, m.DataString)]
-
-
 def _starting_time_s(link: Link) -> float:
     plan = link.plan
     chosen = plan.settings.get(m.NoiseMapSetControl) if isinstance(plan, ProfilePlan) else None
@@ -460,9 +455,7 @@ def _no_message(link: Link, timeout_s: float) -> ResponseTimeout:
 
 def _set_mode(link: Link, mode: SensorMode) -> Steps[None]:
     yield from _need_profile(link)
-    yield from link.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
-    if isinstance(link.plan, ProfilePlan):
-        link.plan = replace(link.plan, mode=mode)
+    yield from set_mode(link, mode)
 
 
 def _set(link: Link, command: m.Command[m.Ack]) -> Steps[None]:
@@ -496,13 +489,13 @@ def _need_profile(link: Link) -> Steps[None]:
     link.plan = ProfilePlan(profile_id=found, loaded=False)
 
 
-def _setting(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) -> Steps[int]:
+def _setting(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt]) -> Steps[int]:
     yield from _need_profile(link)
-    return (yield from _value(link, command, what))
+    return (yield from _value(link, command))
 
 
-def _value(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) -> Steps[int]:
+def _value(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt]) -> Steps[int]:
     values = (yield from link.request(command)).values
     if not values:
-        raise RemoteProtocolError(f"{link.path} reports no value as its {what}")
+        raise RemoteProtocolError(f"{link.name} answers {summary(command)} without a value")
     return values[0]

@@ -107,7 +107,6 @@ class RadarState(Part[KindT], Generic[KindT, LineT]):
         if not hasattr(transport, "write"):
             name = type(self).__name__
             raise TypeError(f"{name} needs an open line; {name}.open({transport!r}) opens a port")
-        self._transport = transport
         self._open_port = open_port or self._port_type
         self._sleep = sleep or self._usual_sleep
         self._make_locks()
@@ -129,7 +128,7 @@ class RadarState(Part[KindT], Generic[KindT, LineT]):
         self.registers: Registers[KindT] = Registers(self)
         self.postprocessing: Postprocessing[KindT] = Postprocessing(self)
         self.diagnostics: Diagnostics[KindT] = Diagnostics(self)
-        self._link.bytes_per_s = capacity_bytes_per_s(transport)
+        self._use(transport)
 
     def _make_locks(self) -> None:
         """Make what keeps callers of this driver apart."""

@@ -15,6 +15,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any, Final
 
+from xethru_protocol.driver.chip import REGISTER_SPACES, RegisterSpace
 from xethru_protocol.driver.files import read_chunks, write_chunks
 from xethru_protocol.driver.firmware import ask_for_bootloader
 from xethru_protocol.driver.link import CONFIG_SETTINGS, SLOW_TIMEOUT_S
@@ -82,18 +83,12 @@ def _frame_area(radar: X4M300) -> Data:
     return CLASSES["FrameArea"](start=start, end=end)
 
 
-def _set_register(setting: X4Setting) -> Callable[..., None]:
-    def set_(radar: X4M300, address: int, value: int) -> None:
-        radar.request(m.X4DriverSet(setting=setting, value=(address, value)))
-
-    return set_
+def _set_register(space: RegisterSpace) -> Callable[..., None]:
+    return lambda radar, address, value: radar.registers.write(space, address, value)
 
 
-def _get_register(setting: X4Setting) -> Callable[..., int]:
-    def get(radar: X4M300, address: int) -> int:
-        return int(_value(radar, m.X4DriverGet(setting=setting, address=address)))
-
-    return get
+def _get_register(space: RegisterSpace) -> Callable[..., int]:
+    return lambda radar, address: radar.registers.read(space, address)
 
 
 def _set_processing(setting: FramePostprocessing) -> Callable[..., None]:
@@ -210,12 +205,8 @@ _XEP: Rows = {
     "x4driver_get_frame_area": _frame_area,
     "x4driver_set_frame_area_offset": _x4_set(X4Setting.FRAMEAREAOFFSET, float),
     "x4driver_get_frame_area_offset": _x4_get(X4Setting.FRAMEAREAOFFSET),
-    "x4driver_set_spi_register": _set_register(X4Setting.SPIREGISTER),
-    "x4driver_get_spi_register": _get_register(X4Setting.SPIREGISTER),
-    "x4driver_set_pif_register": _set_register(X4Setting.PIFREGISTER),
-    "x4driver_get_pif_register": _get_register(X4Setting.PIFREGISTER),
-    "x4driver_set_xif_register": _set_register(X4Setting.XIFREGISTER),
-    "x4driver_get_xif_register": _get_register(X4Setting.XIFREGISTER),
+    **{f"x4driver_set_{space}_register": _set_register(space) for space in REGISTER_SPACES},
+    **{f"x4driver_get_{space}_register": _get_register(space) for space in REGISTER_SPACES},
     "x4driver_write_to_spi_register": lambda radar, address, values: radar.registers.write_burst(
         address, _bytes(values)
     ),
@@ -368,28 +359,27 @@ class Interface:
         return source.radar
 
 
+def _peek(kind: type[Response]) -> Callable[[Interface], int]:
+    return lambda self: self.connection.waiting(kind)
+
+
 class _DataMessages(Interface):
     """The messages of an XEP whose reading fills arguments, and SYSTEM."""
 
-    def peek_message_data_string(self) -> int:
-        return self.connection.waiting(m.DataString)
+    peek_message_data_string = _peek(m.DataString)
+    peek_message_data_byte = _peek(m.DataByte)
+    peek_message_system = _peek(m.System)
 
     def read_message_data_string(self, content_id: Pointer, info: Pointer, data: Pointer) -> int:
         message = self.connection.read(m.DataString, "read_message_data_string")
         content_id.value, info.value, data.value = message.content_id, message.info, message.text
         return 0
 
-    def peek_message_data_byte(self) -> int:
-        return self.connection.waiting(m.DataByte)
-
     def read_message_data_byte(self, content_id: Pointer, info: Pointer, data: list[int]) -> int:
         message = self.connection.read(m.DataByte, "read_message_data_byte")
         content_id.value, info.value = message.content_id, message.info
         data[:] = message.values
         return 0
-
-    def peek_message_system(self) -> int:
-        return self.connection.waiting(m.System)
 
     def read_message_system(self) -> int:
         return self.connection.read(m.System, "read_message_system").code
@@ -423,10 +413,6 @@ def _method(name: str, row: Callable[..., Any]) -> Callable[..., Any]:
 
     call.__name__ = name
     return call
-
-
-def _peek(kind: type[Response]) -> Callable[[Interface], int]:
-    return lambda self: self.connection.waiting(kind)
 
 
 def _read(name: str, kind: type[Response], data: str) -> Callable[[Interface], Data]:
