@@ -169,18 +169,13 @@ class VitalSignsAnalysis:
         )
         self._heard, self._t_s = 0, 0.0
 
-    def iq_of(self, frame: TimedFrame) -> NDArray[np.complex64]:
-        if self._source.is_iq:
-            return np.asarray(frame.samples, dtype=np.complex64)
-        center = self._source.tx_center_frequency
-        iq: NDArray[np.complex64] = downconvert(
-            frame.samples[np.newaxis], tx_center_frequency=center
-        )[0]
-        return iq
-
     def take(self, frame: TimedFrame) -> NDArray[np.complex64]:
         """Take the next frame; return it as complex baseband."""
-        iq = self.iq_of(frame)
+        if self._source.is_iq:
+            iq = np.asarray(frame.samples, dtype=np.complex64)
+        else:
+            center = self._source.tx_center_frequency
+            iq = downconvert(frame.samples[np.newaxis], tx_center_frequency=center)[0]
         if frame.t_s - self._t_s > _LONGEST_GAP_S + 1.0 / self._source.frame_rate_hz:
             self._breathing.reset()
             self._presence.reset()

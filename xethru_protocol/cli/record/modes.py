@@ -33,12 +33,6 @@ from xethru_protocol.wire.errors import (
 
 POLL_S = 0.2  # how late a signal, or the end, may be noticed
 
-ANSWERS = (
-    *(m.Ack, m.Error, m.Pong, m.System),
-    *(m.ReplyByte, m.ReplyFloat, m.ReplyInt, m.ReplyNone, m.ReplyString, m.ReplyUser),
-)
-"""Messages that answer a command, which no recording but a wire capture holds."""
-
 
 class Listen:
     """How to get a module to send what is recorded: here, whatever it sends by itself."""

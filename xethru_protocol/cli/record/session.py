@@ -22,17 +22,19 @@ from xethru_protocol.cli.output import (
     rate_text,
     warn,
 )
-from xethru_protocol.cli.record.modes import ANSWERS, POLL_S, Listen
+from xethru_protocol.cli.record.modes import POLL_S, Listen
 from xethru_protocol.cli.record.output_files import ModuleFiles
 from xethru_protocol.cli.recordings import files_to_replace, remove_older, remove_unfinished
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.operating_system import StopFlag
 from xethru_protocol.recordings import SessionRecorder, WriterOptions
 from xethru_protocol.transport import open_line
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.table import Response
 
+_ONLY_IN_WIRE_CAPTURES = (*m.ANSWERS, m.System, m.ReplyNone, m.ReplyUser)
 _LONGEST_LINE = 65536  # bytes; a line without end is cut there
 
 
@@ -130,7 +132,7 @@ class _RecordedModule(_Source):
         return super().summary() | {"link": self.statistics.summary()}
 
     def _take(self, message: Response, arrival_ns: int) -> None:
-        if self._is_enough or isinstance(message, ANSWERS):
+        if self._is_enough or isinstance(message, _ONLY_IN_WIRE_CAPTURES):
             return
         if self._early is not None:
             self._early.append((message, arrival_ns))
