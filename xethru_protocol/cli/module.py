@@ -113,24 +113,20 @@ def flash(arguments: Namespace) -> int:
             f"checksum {image.checksum:08X}); nothing was sent. Add --yes if that is what you want"
         )
     progress = Progress("xethru flash")
-    state = ""
 
     def note(done: int, total: int) -> None:
-        nonlocal state
-        state = f"{done} of {total} pages"
-        progress.show(lambda: state)
+        progress.show(f"{done} of {total} pages")
 
     with module_at(port, arguments.baudrate) as module:
         try:
             module.firmware.write(image, note)
         except BaseException as error:
-            if state and not isinstance(error, XeThruError):
-                progress.finish(lambda: state)
-                warn(f"xethru flash: stopped after {state}; {UNFINISHED}")
+            if progress.state and not isinstance(error, XeThruError):
+                progress.finish()
+                warn(f"xethru flash: stopped after {progress.state}; {UNFINISHED}")
             raise
         finally:
-            if state:
-                progress.finish(lambda: state)
+            progress.finish()
         about = module.info()
     written = {"pages": image.pages, "bytes": len(image.data), "checksum": f"{image.checksum:08X}"}
     if arguments.json:

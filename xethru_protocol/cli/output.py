@@ -100,27 +100,29 @@ class Progress:
     """
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self.state = ""  # the newest
         self._name = name
         self._clock = clock
         self._rewrites = STDERR.is_terminal
         self._shown_s = clock()
         self._is_open = False  # a line is there that ends in no line end
 
-    def show(self, state: Callable[[], str]) -> None:
+    def show(self, state: str) -> None:
+        self.state = state
         now_s = self._clock()
         if now_s - self._shown_s < (_REWRITE_S if self._rewrites else _LINE_S):
             return
         self._shown_s = now_s
         if self._rewrites:
-            STDERR.offer(rewriting(one_line(state()), STDERR.stream))
+            STDERR.offer(rewriting(one_line(state), STDERR.stream))
             self._is_open = True
         else:
-            warn(f"{self._name}: {state()}")
+            warn(f"{self._name}: {state}")
 
-    def finish(self, state: Callable[[], str]) -> None:
+    def finish(self) -> None:
         """Bring a rewritten line up to date and end it."""
         if self._is_open:
-            STDERR.write_soon(rewriting(one_line(state()), STDERR.stream) + "\n")
+            STDERR.write_soon(rewriting(one_line(self.state), STDERR.stream) + "\n")
             self._is_open = False
 
 

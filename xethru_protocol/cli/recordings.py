@@ -290,26 +290,19 @@ def convert(arguments: Namespace) -> int:
     if is_part_of(Path(source), path):
         raise RecordingError(f"{source} cannot be converted into itself")
     progress = Progress("xethru convert")
-    newest = 0
-
-    def show(messages: int) -> None:
-        nonlocal newest
-        newest = messages
-        progress.show(lambda: f"{newest} messages")
-
     files_to_replace((path,), replace=arguments.force)
     with _whole(path, replace=arguments.force) as fresh:
         try:
             done = convert_recording(
                 source,
                 str(fresh),
-                show,
+                lambda messages: progress.show(f"{messages} messages"),
                 radar=arguments.radar,
                 area_m=area_m,
                 downconversion=downconversion,
             )
         finally:
-            progress.finish(lambda: f"{newest} messages")
+            progress.finish()
     if arguments.json:
         print_json(
             {

@@ -365,7 +365,8 @@ class Session:
             for source in self.sources:
                 if source.ident is not None:  # it was started
                     source.join()
-            progress.finish(self.numbers)
+            progress.show(self.numbers())
+            progress.finish()
         for source in self.sources:
             if source.crash is not None:
                 raise source.crash
@@ -389,6 +390,6 @@ class Session:
                 return "failure" if failed else "count"
             if self.opened_recorder.failure is not None:
                 return "failure"
-            progress.show(self.numbers)
+            progress.show(self.numbers())
             time.sleep(POLL_S / 4)
         return "signal"

@@ -439,20 +439,20 @@ class Screen(io.StringIO):
 def test_progress_rewrites_one_line_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = Screen()
     monkeypatch.setattr(sys, "stderr", screen)
-    times = iter([0.0, 0.05, 0.25, 0.3, 0.5])
+    times = iter([0.0, 0.05, 0.25, 0.3, 0.5, 0.6])
     progress = Progress("xethru record", lambda: next(times))
-    for number in range(4):
-        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
-    progress.finish(lambda: "done")
-    assert screen.getvalue() == "\r1 frames\x1b[K\r3 frames\x1b[K\rdone\x1b[K\n"
+    for number in range(5):
+        progress.show(f"{number} frames")
+    progress.finish()
+    assert screen.getvalue() == "\r1 frames\x1b[K\r3 frames\x1b[K\r4 frames\x1b[K\n"
 
 
 def test_progress_is_a_line_now_and_then_elsewhere(capsys: Capture) -> None:
     times = iter([0.0, 5.0, 10.5, 15.0, 21.0])
     progress = Progress("xethru record", lambda: next(times))
     for number in range(4):
-        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
-    progress.finish(lambda: "done")
+        progress.show(f"{number} frames")
+    progress.finish()
     assert capsys.readouterr().err == "xethru record: 1 frames\nxethru record: 3 frames\n"
 
 
