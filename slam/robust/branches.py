@@ -520,10 +520,13 @@ class Branches:
         nats = min(step.carry_nats, self._carry_nats)
         carried = float(expit(-nats)) if self._has_stood else 0.0
 
-        def doubt(probability: float, motion_covariance: Array, *, knew_few: bool) -> Doubt:
+        knew_few = n_known < rule.least_landmarks and not self._is_on_map
+
+        def doubt(probability: float, motion_covariance: Array, *, is_carry: bool) -> Doubt:
             return Doubt(
                 next_id=step.next_id,
                 knew_few=knew_few,
+                is_carry=is_carry,
                 position_m=position_m,
                 probability=probability,
                 covariance=probability * motion_covariance,
@@ -532,12 +535,9 @@ class Branches:
 
         # An empty map begins where the robot first drives.
         is_possible = carried > 0.0 and bool(n_known or self._now)
-        knew_few = n_known < rule.least_landmarks and not self._is_on_map
         lost = np.diag(rule.lost_variances)
-        carries = [doubt(carried, lost, knew_few=knew_few)] if is_possible else []
-        # Where the map begins is unsure by a slip, too, however many landmarks follow; the
-        # covariance of the filter says so unless it has taken one of them for another.
-        slips = [] if slip is None else [doubt(1.0, slip, knew_few=False)]
+        carries = [doubt(carried, lost, is_carry=True)] if is_possible else []
+        slips = [] if slip is None else [doubt(1.0, slip, is_carry=False)]
         seen = None
         if self._doubts or self._slips:
             seen = seen_ranges(report, self.main.pose, rule)
@@ -572,9 +572,11 @@ class Branches:
         """Return whether a carry was doubted on too few landmarks, and there are enough since.
 
         They are the map then, and the robot is sure of its place among them. Where the few and the
-        start lie on it may be wrong.
+        start lie on it may be wrong. By a slip that is unsure for good; the covariance of the
+        filter says so unless it has taken a landmark for another one.
         """
-        return doubt.knew_few and self._n_reported(doubt.next_id) >= self._rule.least_landmarks
+        has_enough = self._n_reported(doubt.next_id) >= self._rule.least_landmarks
+        return doubt.is_carry and doubt.knew_few and has_enough
 
     def _n_reported(self, first_id: int) -> int:
         ids = self.main.state.landmark_ids

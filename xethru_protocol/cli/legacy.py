@@ -62,13 +62,15 @@ def _compiled(path: Path) -> CodeType:
         raise _ScriptError(f"{path} cannot be read: {error.strerror or error}") from None
     try:
         return compile(source, str(path), "exec", dont_inherit=True)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        reason = str(error) or "it is nested too deeply"
+    except SyntaxError as error:
         raise _ScriptError(
-            f"{path} is not Python 3: {reason}; if it is Python 2, convert it by "
+            f"{path} is not Python 3: {error}; if it is Python 2, convert it by "
             f"'2to3 -w {path.name}' of a Python before 3.13, or 'futurize -w {path.name}' of the "
             "package future"
         ) from None
+    except (ValueError, RecursionError, MemoryError) as error:  # null bytes, or nested too deeply
+        reason = str(error) or "it is nested too deeply"
+        raise _ScriptError(f"{path} is not a Python script: {reason}") from None
 
 
 def _join_threads(others: Collection[threading.Thread]) -> None:

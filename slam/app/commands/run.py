@@ -301,9 +301,9 @@ class SmoothingRequests(SessionObserver):
 
     @contextmanager
     def caught(self) -> Iterator[None]:
-        """Catch the signal meanwhile, in the main thread.
+        """Catch the signal in the main thread until this is left.
 
-        Longer than sinks are open: results are written after they are closed.
+        That is after the sinks are closed, because results are written then.
         """
         previous = signal.signal(signal.SIGUSR1, self._ask)
         try:

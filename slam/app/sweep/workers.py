@@ -177,6 +177,7 @@ def _in_order(futures: Sequence[Any], address: str) -> Iterator[Any]:
             raise AppError(f"--dask {address}: the scheduler has gone") from None
         except ImportError as error:
             raise AppError(
-                f"--dask {address}: a worker cannot import {error.name}; install xethru-hil there"
+                f"--dask {address}: a worker cannot import {error.name}; install xethru-hil there, "
+                "with the same extras"
             ) from None
         future.release()

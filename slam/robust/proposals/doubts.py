@@ -74,6 +74,7 @@ class Doubt:
 
     next_id: int  # landmarks known before them have smaller ids
     knew_few: bool  # whether these were fewer than place a robot
+    is_carry: bool  # one of several that exclude each other; slips add up
     position_m: Array  # shape (2,), where the newest of them may have been
     probability: float  # added up
     # shape (3, 3), of x, y [m] and heading for a pose at the position: the probability times the
@@ -128,14 +129,17 @@ class Doubt:
     def at(self, position_m: Array) -> Array:
         """Return the covariance (3, 3) for a pose at a position (2,).
 
-        A turn by an angle moves it by sin(angle) across the way from the doubt's position, of which
-        the angle is taken, and by cos(angle) - 1 along it. Of that the mean square is added.
+        A turn by an angle a at the doubt's position moves a pose at a distance d from there by
+        d sin(a) across the way, for which d a is taken, and by d (cos(a) - 1) along it. The mean
+        square of the latter is added.
         """
+        probability = self.probability if self.is_carry else 1.0
         away_m = position_m - self.position_m
         T = np.eye(3)
         T[:2, 2] = quarter_turn(away_m)
         covariance = np.asarray(T @ self.covariance @ T.T)
-        covariance[:2, :2] += _mean_square_of_cosine(covariance[2, 2]) * np.outer(away_m, away_m)
+        along = probability * _mean_square_of_cosine(covariance[2, 2] / probability)
+        covariance[:2, :2] += along * np.outer(away_m, away_m)
         return covariance
 
     def add(self, newer: Doubt) -> None:

@@ -214,7 +214,7 @@ def solved_as_one(
     limit = parameters.relinearisation.outlier_sigmas
     is_mistaken = mistaken(every.one, closed, passages, is_certain, limit)
     n_mistaken = len(np.unique(every.one.range_landmarks[is_mistaken]))
-    most_rise = by_chance - 2.0 * rule.most_against * n_mistaken
+    most_rise = by_chance - 2.0 * rule.most_against * n_mistaken  # a nat is a cost of two
     if not n_mistaken or most_rise <= 0.0:
         return None
     some = trial(rows[is_mistaken], most_rise)

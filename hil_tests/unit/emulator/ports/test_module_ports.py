@@ -20,7 +20,7 @@ from emulator.chip import Pace
 from emulator.module.settings import DeviceOptions
 from emulator.ports.event_loop import Server
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
-from emulator.ports.pty import LinkError
+from emulator.ports.pty import LinkError, PortWatch
 from emulator.x4m300 import radar_device
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.emulator.doubles import IDENTITY, PortHost, RampSource, ramp_device
@@ -218,7 +218,9 @@ def test_the_terminal_is_deaf_while_a_client_has_the_module(bench: Bench) -> Non
 def test_who_has_the_terminal_open_keeps_the_module(bench: Bench) -> None:
     terminal = bench.pty()
     assert terminal.ask(m.Ping()) == PONG
-    if not getattr(bench.opened.services[1], "works", False):
+    watches = [one for one in bench.opened.services if isinstance(one, PortWatch)]
+    assert watches
+    if not all(one.works for one in watches):
         pytest.skip("this system does not tell who opens a terminal")
     assert bench.tcp().is_hung_up()
     terminal.close()

@@ -24,11 +24,12 @@ CARRY = np.diag([1e-4, 1e-4, 0.01])
 LEVER_M = 0.1
 
 
-def doubtful(x_m: float, probability: float = 1.0) -> Doubt:
+def doubtful(x_m: float, probability: float = 1.0, *, is_carry: bool = True) -> Doubt:
     """Return a doubt at a place on the x axis: of a motion of covariance CARRY."""
     return Doubt(
         next_id=9,
         knew_few=False,
+        is_carry=is_carry,
         position_m=np.array([x_m, 0.0]),
         probability=probability,
         covariance=probability * CARRY,
@@ -122,11 +123,27 @@ def test_a_carry_from_one_of_two_places_has_the_mean_of_both() -> None:
     both = doubtful(0.0)
     both.add(doubtful(1.0))
     sums = np.array([[2e-4, 0.0, 0.0], [0.0, 2e-4 + 0.09 + 0.04, 0.05], [0.0, 0.05, 0.02]])
-    along = np.diag([along_the_way(0.01) + 4.0 * along_the_way(0.02), 0.0, 0.0])
+    along = np.diag([along_the_way(0.01) + 2.0 * 4.0 * along_the_way(0.01), 0.0, 0.0])
     np.testing.assert_allclose(at(both, 3.0), (sums + along) / 2.0)
     apart = doubted_covariance([doubtful(0.0), doubtful(1.0)], np.array([3.0, 0.0]))
     along = np.diag([(9.0 + 4.0) * along_the_way(0.01), 0.0, 0.0])
     np.testing.assert_allclose(apart, (sums + along) / 2.0)
+
+
+@pytest.mark.parametrize("probability", [0.01, 0.1, 1.0])
+def test_what_a_carry_adds_along_the_way_is_in_proportion_to_its_probability(
+    probability: float,
+) -> None:
+    found = doubtful(0.0, probability).at(np.array([2.0, 0.0]))
+    assert found[0, 0] == pytest.approx(probability * (1e-4 + 4.0 * along_the_way(0.01)))
+
+
+def test_slips_add_up() -> None:
+    """The turn of two slips has the sum of their variances."""
+    both = doubtful(0.0, is_carry=False)
+    both.add(doubtful(0.0, is_carry=False))
+    found = both.at(np.array([2.0, 0.0]))
+    assert found[0, 0] == pytest.approx(2e-4 + 4.0 * along_the_way(0.02))
 
 
 def test_doubts_that_are_joined_need_what_both_need() -> None:
