@@ -42,7 +42,8 @@ THICK_SIGMAS: Annotated[float, Origin.CHOSEN] = 3.0
 FIRST_NOISE_FACTOR: Annotated[float, Origin.CHOSEN] = 30.0
 """By what the noise of measurements is multiplied first, where a solution starts far away."""
 SECOND_NOISE_FACTOR: Annotated[float, Origin.CHOSEN] = 8.0
-"""By what it is multiplied then, before the solution with the noise as it is."""
+"""By what it is multiplied then, before the solution with the noise as it is. Ranges that would be
+outliers even so, where a loop is closed, are of another thing."""
 SIGMA_PER_MEDIAN = 1.4826  # the standard deviation of normal noise over its median magnitude
 NEIGHBOURHOOD_M = 1.5  # default of `MapRule.neighbourhood_m`: in a room
 
