@@ -402,10 +402,9 @@ def _check_port(path: str, description: str) -> Report:
 
 def _introduction(probe: PortProbe) -> str:
     try:
-        info = probe.info
+        info, profile = probe.info, probe.profile_id
     except XeThruError:
         return ""
-    profile = probe.profile_id
     parts = (
         info.order_code or info.firmware_id,
         f"serial {info.serial_number}" if info.serial_number else None,
