@@ -3,8 +3,8 @@
 A carry that is possible during a stop, or a possible slip of the wheels, adds to the reported
 covariance. The pose itself stays where it is. A doubt ends when landmarks known before it fit the
 pose, and their ranges leave no direction of the motion open: two landmarks abeam of the robot say
-nothing of where it is along its course. Where too few were known before it, the doubt ends once
-enough are known since.
+nothing of where it is along its course. Where too few were known before a carry, its doubt ends
+once enough are known since; that of a slip stays.
 """
 
 from __future__ import annotations

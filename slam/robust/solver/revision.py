@@ -130,6 +130,7 @@ class _Trial:
     parameters: BackEndParameters
 
     def merged(self, together: Solution | None) -> Merged | None:
+        """Return a solution as one with what it is of; None of none."""
         if together is None:
             return None
         return Merged(problem=self.one, solution=together, left_out=self.left_out)
