@@ -384,8 +384,8 @@ class RobustConfig(_ConfigTable):
     range_floor_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
     """What the front end's own deviation leaves out (the shape of targets), added in squares."""
     association_doubt_m: Annotated[NonNegative, Origin.CHOSEN] = 0.0
-    """Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it. The
-    ranges of a tracklet, decided on together, keep it."""
+    """Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it.
+    Ranges that new landmarks are fitted to keep it."""
     huber_sigmas: Annotated[float, Field(gt=0), Origin.QUANTILE] = math.inf
     """Innovations of more standard deviations weigh less: of normal errors, one in 22."""
     max_misfit: Annotated[Positive, Origin.CHOSEN] = 1.5

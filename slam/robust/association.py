@@ -12,7 +12,8 @@ answers, along its normal n, from wherever the antenna q = p + R m is:
 
 Known landmarks come first, one to one. A landmark takes part if it may be in view and if the prior
 alone, without the noise of a range, predicts its ranges more surely than a range measures them;
-else only tracklets decide. For each landmark one option is chosen, a range of some of the radars of
+else what its ranges show is a new point at first, which may turn out to be the landmark. For each
+landmark one option is chosen, a range of some of the radars of
 the side, or of none, at the cost
 
     nu^T S^-1 nu + ln det(2 pi S) + 2 m ln(clutter density) - 2 m ln(Pd / (1 - Pd))
@@ -349,11 +350,11 @@ def find_known(
     than the radars' ``sigma_m`` take no part, nor do the rows ``beacons``, whose ranges have labels
     and which do not answer every time.
     """
-    noise, rule, tracklets = parameters.ranges, parameters.continuation, parameters.tracklets
+    noise, rule, gates = parameters.ranges, parameters.continuation, parameters.initialisation
     ranges_m, variances, blurred_m = _padded(scans, len(side_of), noise)
     has_frame = np.zeros(len(side_of), dtype=np.bool_)
     has_frame[[scan.radar for scan in scans]] = True
-    margin_m = tracklets.gate_sigmas * noise.sigma_m
+    margin_m = gates.gate_sigmas * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[has_frame]
     inside[:, list(beacons)] = False
     rows = np.flatnonzero(inside.any(axis=0))
@@ -390,13 +391,13 @@ def find_known(
                 noise.max_range_m,
                 rule.view_margin_rad,
                 margin_m,
-                tracklets.edge_rad,
+                gates.edge_rad,
                 parameters.map.view_inset_m,
                 noise.sigma_m**2,
                 *chdtri([1, 2], TAIL_PROBABILITY),
                 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau),
                 math.hypot(noise.sigma_m, parameters.branches.model_sigma_m),
-                tracklets.gate_sigmas,
+                gates.gate_sigmas,
                 rule.blur_m,
             ]
         ),
@@ -588,7 +589,7 @@ def _maybe_in_view(
     What a detection is of may be predicted out of view. Were it left out, its neighbour would have
     no rival.
     """
-    noise, gate_sigmas = parameters.ranges, parameters.tracklets.gate_sigmas
+    noise, gate_sigmas = parameters.ranges, parameters.initialisation.gate_sigmas
     sigmas = gate_sigmas * np.sqrt(state.pose_covariance().diagonal())
     spread_m, spread_rad = float(np.hypot(sigmas[0], sigmas[1])), float(sigmas[2])
     margin_rad = parameters.continuation.view_margin_rad + spread_rad
@@ -619,7 +620,7 @@ def find_points(
     any other detection for the landmark.
     """
     assert scan.bearings_rad is not None
-    noise, tracklets, radar = parameters.ranges, parameters.tracklets, scan.radar
+    noise, gates, radar = parameters.ranges, parameters.initialisation, scan.radar
     free, hit, row_of_label = waiting
     inside = _maybe_in_view(state, seen, radar, parameters)
     inside[list(hit)] = False
@@ -652,7 +653,7 @@ def find_points(
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     clutter = noise.clutter_per_m / noise.field_of_view_rad
     is_free = inside[rows] & ~np.isin(rows, list(row_of_label.values()))
-    own, most = np.flatnonzero(is_free), tracklets.gate_sigmas**2
+    own, most = np.flatnonzero(is_free), gates.gate_sigmas**2
     if len(own) and others:
         log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])[k:, own]
         evidence = np.where(is_near[k:, own], log_n + math.log(odds / clutter), -math.inf)
@@ -675,7 +676,7 @@ def find_points(
             if is_sure[one, at] or evidence[one, at] - max(rivals) > MARGIN_NATS:
                 against_new.append(float(evidence[one, at] - unmapped[one]))
                 pairs.append((others[one], int(rows[own[at]])))
-    inset, edge = parameters.map.view_inset_m, tracklets.edge_rad
+    inset, edge = parameters.map.view_inset_m, gates.edge_rad
     well = seen.inside(noise, -edge, -inset)[radar, rows]
     is_known = (
         np.linalg.eigvalsh(

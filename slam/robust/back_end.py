@@ -7,6 +7,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,23 +43,20 @@ from slam.robust.association import (
 from slam.robust.initialisation import (
     BodyPoint,
     FeatureRows,
-    Guess,
+    FittedRanges,
     Option,
     PointDetection,
     Question,
-    Search,
-    Sightings,
     TentativePoint,
     TentativePoints,
-    Tracklet,
     UnassignedRanges,
     body_point,
     certain_row,
+    crossing,
     detections_of,
     initialise_landmark,
     match,
     options_of,
-    point_guesses,
     possible_rows,
     update_with_point,
 )
@@ -144,25 +142,20 @@ class RobustBackEnd:
         self._side_of = np.zeros(len(rig.mounts), dtype=np.intp)
         for number, side in enumerate(self._sides):
             self._side_of[list(side)] = number
-        rule = parameters.tracklets
-        scale = rule.drift_share * parameters.wheels.scale_sigma
-        self._unassigned = UnassignedRanges(
-            max(rule.window, rule.long_window),
-            len(rig.mounts),
-            parameters.ranges.sigma_m,
-            scale,
-            scale * parameters.wheels.walk_lever_m,
-        )
+        self._unassigned = UnassignedRanges(parameters)
         self._tentative = TentativePoints(parameters)
+        # Of each side, points at which ranges cross
+        self._crossings = [TentativePoints(parameters) for _ in self._sides]
         self._existence = Existence(
-            parameters.map, rule.min_frames, parameters.ranges.detection_probability
+            parameters.map,
+            parameters.initialisation.min_frames,
+            parameters.ranges.detection_probability,
         )
         # Ids of landmarks of the map are smaller.
         self._first_id = 0 if saved is None else saved.next_id
         prior = None if saved is None else take_map(self.state, saved, rig, start)
         self._log = RunLog(parameters.wheels, parameters.map.gap_poses, prior)
         self._walls = WallKeeper(self.state, parameters)
-        self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         # Way of the wheels since the start: metres, and keyframes, as `RunLog` counts them; where
         # the two counts differ by rounding, `RunLog.mark_key` makes past poses keyframes
         self._way_m, self._way_keys = 0.0, 0.0
@@ -379,7 +372,8 @@ class RobustBackEnd:
     def _move(self, motion: Motion) -> None:
         predict(self.state, motion, self.parameters.wheels)
         self._unassigned.move(motion)
-        self._tentative.move(motion)
+        for waiting in (self._tentative, *self._crossings):
+            waiting.move(motion)
         self._walls.tentative.move(motion)
 
     def _look_for_slip(self, motion: Motion, elapsed_s: float) -> None:
@@ -442,7 +436,8 @@ class RobustBackEnd:
         self._log.add_motion(increment, free, is_loose=True)
         self._slips.begin_anew()
         self._unassigned.clear()
-        self._tentative.clear()
+        for waiting in (self._tentative, *self._crossings):
+            waiting.clear()
         self._walls.tentative.clear()
         self._images.begin_anew(self._log.n_poses)
         state = self.state
@@ -475,8 +470,6 @@ class RobustBackEnd:
         antennas = antennas_of(self.rig, looks, self.state.calibration, self.state.mounts_m)
         # Steps in which no radar looked do not count towards windows of frames.
         has_look = bool(antennas.has_frame.any())
-        if has_look:
-            self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         association_m = self.parameters.ranges.association_sigma_m
         added_m = math.hypot(association_m, self.state.range_errors.added_m)
         with_bearings = [scan for scan in scans if scan.bearings_rad is not None]
@@ -503,7 +496,8 @@ class RobustBackEnd:
         if has_look or patches:
             self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_patches = self._take_patches(patches, added_m)
-        of_tracklets = self._initialise_landmarks() if has_look else []
+        if has_look:
+            self._take_crossings(antennas)
         self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
@@ -515,7 +509,7 @@ class RobustBackEnd:
         if decide:
             self._decide()
         self._log.set_causal(self.state.pose)
-        evidence = (*report.evidence, *evidence_of_misses, *of_patches, *of_tracklets)
+        evidence = (*report.evidence, *evidence_of_misses, *of_patches)
         return replace(report, evidence=evidence)
 
     def _check_radars(self, scans: Sequence[RangeScan]) -> None:
@@ -674,7 +668,7 @@ class RobustBackEnd:
 
     def _initialise_beacons(self) -> None:
         """Bring the beacons into the map whose ranges have one place."""
-        fewest = self.parameters.tracklets.min_frames
+        fewest = self.parameters.initialisation.min_frames
         share = 1.0 + self.parameters.relinearisation.run_share
         for label, waiting in list(self._waiting.items()):
             if waiting.n_ranges < max(fewest, waiting.try_at):
@@ -757,7 +751,7 @@ class RobustBackEnd:
         miss = math.log(1.0 - noise.detection_probability)
         missed = {id_ for _, id_ in refused} | {ids[row] for row in found.missed}
         # What one scan misses, the next ones miss likely, too: those of a window count as one.
-        self.evidence += miss * len(missed - hit_ids) / self.parameters.tracklets.window
+        self.evidence += miss * len(missed - hit_ids) / self.parameters.initialisation.window
         for landmark_id in sorted(missed - hit_ids):
             self._existence.miss(landmark_id, 0.5 * odds)
         misses = [(landmark_id, miss) for landmark_id in sorted(missed - hit_ids)]
@@ -926,9 +920,12 @@ class RobustBackEnd:
 
     def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
         """Update the landmark in a row with a tentative one, or add it to the map."""
-        state, tracklet = self.state, self._ranges_of(tentative)
-        if tracklet is not None:
-            point = self._body_point(tracklet)
+        state, ranges = self.state, None
+        if tentative.is_of_patches:
+            side = self._sides[self._side_of[tentative.seen[-1].radar]]
+            ranges = self._unassigned.fit(tentative.point, side, state)
+        if ranges is not None:
+            point = self._as_uncertain(ranges.point)
         if row is None:
             radius = tentative.radius(state.radius_sigma_m) if state.radius_sigma_m else None
             landmark_id = initialise_landmark(state, point, radius)
@@ -945,8 +942,8 @@ class RobustBackEnd:
         for way in ways:
             self._existence.take_mirror(landmark_id, way)
         self._log.add_detections(landmark_id, tentative.seen)
-        if tracklet is not None:
-            self._use(landmark_id, tracklet.seen)
+        if ranges is not None:
+            self._use(landmark_id, ranges)
 
     def _way_to_mirror(self, detection: PointDetection) -> MirrorWay | None:
         """Return the way from a detection to its mirror image in the map, if it has one."""
@@ -957,66 +954,53 @@ class RobustBackEnd:
             heading_rad = self._log.heading_at(detection.pose)
         return detection.way_to_mirror(heading_rad, self.pose_covariance[2, 2])
 
-    def _ranges_of(self, tentative: TentativePoint) -> Tracklet | None:
-        """Return the unassigned single ranges of what patches hold, and use them up."""
-        rule = self.parameters.tracklets
-        if not tentative.is_of_patches:
-            return None
-        side = self._sides[self._side_of[tentative.seen[-1].radar]]
-        search = Search(radars=side, window=rule.long_window, min_frames=rule.min_hits_per_radar)
-        guess = Guess(target=tentative.point.point_m, covariance=tentative.point.covariance)
-        tracklet = self._walls.tracker().follow(guess, self._unassigned, search)
-        if tracklet is not None:
-            self._unassigned.use_up(tracklet.members)
-        return tracklet
+    def _take_crossings(self, antennas: Antennas) -> None:
+        """Let ranges of nothing known, of radars without images, begin landmarks where they cross.
 
-    def _initialise_landmarks(self) -> list[tuple[int, float]]:
-        """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
-
-        Returns of each the landmark, and how much likelier its ranges are than as false ones.
+        Points of patches lie apart from their neighbours, and show walls.
         """
-        rule, evidence = self.parameters.tracklets, list[tuple[int, float]]()
-        for side in self._sides:
-            # Patches show points and walls sooner, and apart from their neighbours. A radar without
-            # frames for long takes no part.
-            radars = [
-                radar
-                for radar in side
-                if radar not in self._images.radars and self._silent[radar] <= rule.window
-            ]
-            # The ranges of one radar alone do not show where on its arcs a point is.
-            if len(radars) < 2 or not all(self._unassigned.newest(radar) for radar in radars):
-                continue
-            guesses = point_guesses(self._unassigned, radars, self.parameters.ranges, rule)
-            if not guesses:
-                continue
-            search = Search(radars=radars, window=rule.window, min_frames=rule.min_frames)
-            tracker, is_point = self._walls.tracker(), self._walls.is_point
-            for tracklet in tracker.find(guesses, self._unassigned, search, is_point):
-                nats = tracklet.evidence(self.parameters.ranges)
-                evidence.append((self._place(tracklet), nats))
-        return evidence
+        pose, fewest = self._log.n_poses - 1, self.parameters.initialisation.min_frames
+        for side, waiting in zip(self._sides, self._crossings, strict=True):
+            radars = [radar for radar in side if radar not in self._images.radars]
+            for pair in combinations(radars, 2):
+                if not antennas.has_frame[list(pair)].all():
+                    continue
+                of_pair = [
+                    one
+                    for ranges in product(*map(self._unassigned.newest, pair))
+                    for one in crossing(self.state, antennas, ranges, self.parameters, pose)
+                ]
+                waiting.take([seen for seen, _ in of_pair], [point for _, point in of_pair])
+            for tentative in waiting.unclear():
+                ranges = self._unassigned.fit(
+                    tentative.point, radars, self.state, is_of_ranges=True
+                )
+                if ranges is None or ranges.n_frames < fewest or ranges.is_flat:
+                    continue
+                waiting.remove(tentative)
+                self._place_ranges(ranges)
 
-    def _place(self, tracklet: Tracklet) -> int:
-        """Let a tracklet be a landmark, new or of the map; return its id."""
-        state, point = self.state, self._body_point(tracklet)
+    def _place_ranges(self, ranges: FittedRanges) -> None:
+        """Let ranges be those of the landmark that their point certainly is, or of a new one."""
+        state, point = self.state, self._as_uncertain(ranges.point)
         row = match(state, point)
         if row is None:
             landmark_id = initialise_landmark(state, point)
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        self._use(landmark_id, tracklet.seen)
-        return landmark_id
+        self._use(landmark_id, ranges)
 
-    def _body_point(self, tracklet: Tracklet) -> BodyPoint:
-        point, share = tracklet.body_point(), max(self.state.range_errors.variance_share, 1.0)
+    def _as_uncertain(self, point: BodyPoint) -> BodyPoint:
+        """Return a point that ranges were fitted to, as uncertain as ranges of the run are."""
+        share = max(self.state.range_errors.variance_share, 1.0)
         return replace(point, covariance=share * point.covariance)
 
-    def _use(self, landmark_id: int, seen: Sightings) -> None:
-        """Count and log the ranges of a tracklet as those of a landmark or a wall."""
-        self._existence.hit(landmark_id, seen.n_frames)
-        self._log.add_sightings(landmark_id, seen)
+    def _use(self, landmark_id: int, ranges: FittedRanges) -> None:
+        """Count and log ranges that were of nothing known as those of a landmark."""
+        self._unassigned.use_up(ranges)
+        self._existence.hit(landmark_id, ranges.n_frames)
+        self._log.add_unassigned(landmark_id, ranges.rows)
 
     def _delete_vanished(self, *, solve: bool) -> None:
         """Delete landmarks that are not there any more; without ``solve``, no beacons."""

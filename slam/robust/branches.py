@@ -367,12 +367,12 @@ class Branches:
         if on_map is not None and on_map.pose is not None:
             start = np.array(on_map.pose), np.array(rule.start_sigmas)
         self.main = RobustBackEnd(rig, parameters, saved, start)
-        self._look_every, self._window = parameters.map.look_every, parameters.tracklets.window
-        self._fewest = parameters.tracklets.min_frames
+        self._look_every, self._window = parameters.map.look_every, parameters.initialisation.window
+        self._fewest = parameters.initialisation.min_frames
         self._steps: dict[int, Step] = {}  # by number, those that are needed still
         self._now = 0  # number of the next step
-        self._noise, self._gate_sigmas = parameters.ranges, parameters.tracklets.gate_sigmas
-        self._edge_rad = parameters.tracklets.edge_rad
+        self._noise, self._gate_sigmas = parameters.ranges, parameters.initialisation.gate_sigmas
+        self._edge_rad = parameters.initialisation.edge_rad
         self._lever_m = max(math.hypot(mount.x_m, mount.y_m) for mount in rig.mounts)
         self._increment: Array | None = None
         self._covariance: Array | None = None  # of its noise, where that is known

@@ -1,10 +1,12 @@
-"""New landmarks: ranges of the last frames that one target at rest explains.
+"""New landmarks: detections of nothing known that one point at rest explains.
 
-A target is guessed from ranges of the newest frame and followed back through the frames along
-odometry by a small Kalman filter on its two coordinates in the newest body frame; each frame gives
-the unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
-frames hold it and its residuals are as small as those of a target at rest: clutter has no past, and
-a ghost, the fix of two ranges of different targets, does not stay at rest while the robot moves.
+Where a bearing is known with the range, one detection has a place: a point of a patch, a detection
+of a sensor that measures both, or, of radars without images, two ranges that cross. Clutter has a
+place, too, and so has a ghost, the crossing of two ranges of different targets, which does not stay
+at rest while the robot moves. So a detection waits as a tentative landmark, which is followed along
+odometry by a Kalman filter on its two coordinates in the newest body frame, and becomes a landmark
+when enough scans hold it and they agree. Then it is fitted to the single ranges of the last frames
+that are of nothing known and near enough to it.
 
 The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in the
 antenna's position a; a point's is a hyperbola::
@@ -12,11 +14,9 @@ antenna's position a; a point's is a hyperbola::
     point at b:     r = |b - a|
     wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
 
-What fits the law of a wall better is no landmark; walls are found by patches
-(:mod:`slam.robust.walls`). For ranges, a corner of two walls is a point. Both laws have two
-unknowns, so the difference of their chi-squares is twice the logarithm of the likelihood ratio (and
-that of their BIC). Over a short displacement, or at a great distance, it is near zero. Source:
-Leonard and Durrant-Whyte, "Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
+Of crossings, what fits a plane wave no worse is no landmark; walls are found by patches
+(:mod:`slam.robust.walls`). A corner of two walls is a point. Source: Leonard and Durrant-Whyte,
+"Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
 
 A point b with noise n and known dependence D_b on the unknowns of the radars measures
 
@@ -26,26 +26,20 @@ and a new landmark is l = p + R b with e_l = e_p + R D_b e_b + R n: correlated w
 pose is correlated with. (In right-invariant errors the heading enters neither.) The ranges of a few
 frames end at the surface: with o the direction away from where they were taken, the axis of a
 landmark of radius rho is seen at b + rho o, and H has e_rho: -o.
-
-Where a bearing is measured with the range, one detection has a place. As clutter has one, too, it
-waits as a tentative landmark, and becomes one when enough scans hold it and they agree.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtri
 
-from slam.geometry import compose
-from slam.robust import kernels
+from slam.geometry import compose, wrap_angles
 from slam.robust.association import (
     LONGEST_M,
     Antennas,
@@ -66,7 +60,6 @@ from slam.robust.parameters import (
     VAGUE_RADIUS,
     BackEndParameters,
     RangeNoise,
-    TrackletRule,
     is_plausible,
 )
 from slam.robust.state import (
@@ -74,6 +67,7 @@ from slam.robust.state import (
     POSITION,
     Array,
     Indices,
+    Layout,
     Motion,
     State,
     quarter_turn,
@@ -82,80 +76,124 @@ from slam.robust.state import (
 
 _FORBIDDEN = 1e9
 _LEAST_WAY_M = 1e-6
-# Unknowns of the radars surer than this share of a range's standard deviation are taken for known.
-_KNOWN_SHARE = 0.1
 # Stands for what is seen now where it is compared with rows of the map
 SEEN = -1
-# Room for ranges of one radar in one frame, at first
-_FEWEST_SLOTS = 8
-# Gauss-Newton steps of a fit of a law, its damping, the smallest share of a step that is tried, and
-# the decrease of chi-square that ends a fit; what keeps matrices regular
-_STEPS, _DAMPING, _LEAST_SHARE, _LEAST_DECREASE, _FLOOR = 8, 1e-6, 1e-3, 1e-4, 1e-12
+# How often a point is fitted to the ranges nearest to it; what keeps matrices regular
+_FITS, _FLOOR = 3, 1e-12
+# A range that is of nothing known; every frame of a radar has a NaN, too. Antenna, its yaw and the
+# robot's heading are in the frame of odometry; ``way`` is what was driven until then, in metres and
+# radians. For the log there are the pose, the antenna in its body frame were the mount where the
+# rig has it, and the turn since then.
+_UNASSIGNED = np.dtype(
+    [
+        ("frame", np.intp),
+        ("radar", np.intp),
+        ("range_m", np.float64),
+        ("sigma_m", np.float64),
+        ("antenna_m", "2f8"),
+        ("yaw_rad", np.float64),
+        ("heading_rad", np.float64),
+        ("way", "2f8"),
+        ("pose", np.intp),
+        ("nominal_m", "2f8"),
+        ("turn_rad", np.float64),
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sightings:
-    """k ranges of one target at rest, newest first."""
+class FittedRanges:
+    """Ranges of one point, and the point as they show it."""
 
-    antennas_m: Array  # shape (k, 2), in one frame
-    headings_rad: Array  # shape (k,), of the body in that frame
-    ranges_m: Array  # shape (k,), the offsets of the state removed
-    # shape (k,): variances [m^2] of noise and of odometry since then
-    variances: Array
-    radars: Indices  # shape (k,)
-    # As measured, for the log: the pose of each (k,), its antenna in the body frame of that pose
-    # were its mount where the rig has it (k, 2), the robot's turn from the pose to the sample,
-    # range [m] and standard deviation (k,)
-    poses: Indices
-    nominal_m: Array
-    turns_rad: Array
-    measured_m: Array
-    sigmas_m: Array
-    n_radars: int  # of the rig
+    point: BodyPoint
+    rows: NDArray[np.void]  # as `_UNASSIGNED` has them
+    at: Indices  # where they are among the unassigned ones
+    chi_square: float
+    chi_square_of_wall: float
+
+    @property
+    def is_flat(self) -> bool:
+        """Return whether the echo of a wall fits as well, which is a plane wave."""
+        return self.chi_square_of_wall <= self.chi_square
 
     @property
     def n_frames(self) -> int:
-        return len(set(self.poses.tolist()))
+        return len(np.unique(self.rows["pose"]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Looks:
+    """Ranges of nothing known, NaN for each frame of a radar, in one frame of coordinates."""
+
+    rows: NDArray[np.void]  # shape (k,)
+    antennas_m: Array  # shape (k, 2)
+    yaws_rad: Array  # shape (k,), of the antennas
+    headings_rad: Array  # shape (k,), of the robot
+    ranges_m: Array  # shape (k,), the offsets of the state removed
+    variances: Array  # shape (k,), of noise and of odometry since then
+    layout: Layout
+
+    def at_point(self, point_m: Array, errors: Array) -> tuple[Array, Array, Array]:
+        """Return residuals, d(range) / d(errors) (k, 2 + q), and angles off the boresight.
+
+        ``errors`` are those of the point and of the q unknowns of the radars.
+        """
+        away = point_m + errors[:2] - self.antennas_m
+        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
+        u = away / distance[:, None]
+        J = np.hstack([u, self.layout.ranges_by_radars(u, self.headings_rad, self.rows["radar"])])
+        off = np.abs(wrap_angles(np.arctan2(u[:, 1], u[:, 0]) - self.yaws_rad))
+        return self.ranges_m - distance - J[:, 2:] @ errors[2:], J, off
+
+    def nearest(self, misses_m: Array) -> Indices:
+        """Return where the least miss is in each frame of each radar, (k,) [m], if it is finite."""
+        order = np.argsort(misses_m, kind="stable")
+        order = order[: np.count_nonzero(np.isfinite(misses_m))]
+        first = np.unique(self.rows[["frame", "radar"]][order], return_index=True)[1]
+        return np.asarray(order[first])
+
+    def share_hit(self, k: Indices, point_m: Array, noise: RangeNoise) -> float:
+        """Return which share of the frames with a point in view some ranges hit."""
+        away = point_m - self.antennas_m
+        distance = np.hypot(away[:, 0], away[:, 1])
+        off = np.abs(wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - self.yaws_rad))
+        sees = (off <= noise.field_of_view_rad / 2) & (distance >= noise.min_range_m)
+        sees &= distance <= noise.max_range_m
+        hit = np.unique(self.rows["frame"][k])
+        return len(hit) / len(np.union1d(hit, self.rows["frame"][sees]))
+
+    def chi_square_of_wall(
+        self, k: Indices, outward: Array, by_radars: Array, of_radars: Array
+    ) -> float:
+        """Return the least chi-square of some ranges as those of a wall across a direction.
+
+        It may be at any depth and turned a little. ``of_radars`` (q, q) is the information on the
+        unknowns of the radars.
+        """
+        ahead_m, across_m = (
+            self.antennas_m[k] @ np.column_stack([outward, quarter_turn(outward)])
+        ).T
+        sigmas_m = np.sqrt(self.variances[k])
+        rows = np.column_stack([np.ones(len(k)), across_m, by_radars]) / sigmas_m[:, None]
+        rows = np.vstack([rows, np.pad(np.linalg.cholesky(of_radars).T, ((0, 0), (2, 0)))])
+        depths = np.pad((self.ranges_m[k] + ahead_m) / sigmas_m, (0, len(of_radars)))
+        residual = depths - rows @ np.linalg.lstsq(rows, depths)[0]
+        return float(residual @ residual)
 
 
 class UnassignedRanges:
-    """The ranges of the last frames that are of nothing known, and the robot's way between them.
+    """The ranges of the last frames that are of nothing known, and the robot's way between them."""
 
-    ``sigma_m`` is for ranges whose scan has none; ``drift_per_m`` and ``drift_per_rad_m`` are what
-    the standard deviation of a range gains per metre of way back, and per radian of turn. The
-    frames are rows of a ring; a range that is used is NaN.
-    """
-
-    def __init__(
-        self,
-        capacity: int,
-        n_radars: int,
-        sigma_m: float,
-        drift_per_m: float,
-        drift_per_rad_m: float,
-    ) -> None:
-        self._sigma_m = sigma_m
-        self._drifts = (drift_per_m, drift_per_rad_m)
+    def __init__(self, parameters: BackEndParameters) -> None:
+        rule, wheels = parameters.initialisation, parameters.wheels
+        self._parameters = parameters
+        drift_per_m = rule.drift_share * wheels.scale_sigma
+        # What the standard deviation of a range gains per metre of way back, and per radian
+        self._drifts = np.array([drift_per_m, drift_per_m * wheels.walk_lever_m])
         self._pose = np.zeros(3)
         self._way = np.zeros(2)  # metres and radians, always growing
-        self._newest, self._count = -1, 0
-        self._places = np.zeros((capacity, n_radars, 3))
-        self._mounts_m, self._nominal_m = np.zeros((2, capacity, n_radars, 2))
-        self._turns_rad = np.zeros((capacity, n_radars))
-        self._poses, self._ways = np.zeros((capacity, 3)), np.zeros((capacity, 2))
-        self._pose_indices = np.zeros(capacity, dtype=np.intp)
-        self._has_frame = np.zeros((capacity, n_radars), dtype=np.bool_)
-        self._reserve(_FEWEST_SLOTS)
-
-    def _reserve(self, most: int) -> None:
-        """Make room for so many ranges of a radar in a frame."""
-        shape = (*self._has_frame.shape, most)
-        ranges_m, sigmas_m = np.full(shape, np.nan), np.zeros(shape)
-        if self._count:
-            k = self._ranges_m.shape[2]
-            ranges_m[..., :k], sigmas_m[..., :k] = self._ranges_m, self._sigmas_m
-        self._ranges_m: Array = ranges_m
-        self._sigmas_m: Array = sigmas_m
+        self._frame = 0
+        self._rows = np.empty(0, dtype=_UNASSIGNED)
 
     def move(self, motion: Motion) -> None:
         step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
@@ -164,7 +202,7 @@ class UnassignedRanges:
 
     def clear(self) -> None:
         """Forget all frames: they were taken at another place."""
-        self._count = 0
+        self._rows = self._rows[:0]
 
     def keep(
         self,
@@ -174,94 +212,125 @@ class UnassignedRanges:
         used: set[tuple[int, int]],
     ) -> None:
         """Store a frame without the ranges used, given as (radar, index)."""
-        most = max((len(scan.ranges_m) for scan in scans), default=0)
-        if most > self._ranges_m.shape[2]:
-            self._reserve(2 * most)
-        self._newest = f = (self._newest + 1) % len(self._poses)
-        self._count = min(self._count + 1, len(self._poses))
-        turn = rotation(self._pose[2])
-        self._places[f, :, :2] = antennas.position_m @ turn.T + self._pose[:2]
-        self._places[f, :, 2] = antennas.yaw_rad + self._pose[2]
-        self._mounts_m[f], self._has_frame[f] = antennas.position_m, antennas.has_frame
-        self._nominal_m[f], self._turns_rad[f] = antennas.nominal_m, antennas.turns_rad
-        self._poses[f], self._ways[f], self._pose_indices[f] = self._pose, self._way, pose_index
-        self._ranges_m[f] = np.nan
-        for scan in scans:
-            for index, range_m in enumerate(scan.ranges_m):
-                if (scan.radar, index) in used or not 0.0 < range_m < LONGEST_M:
-                    continue
-                at = f, scan.radar, index
-                self._ranges_m[at] = range_m
-                self._sigmas_m[at] = scan.sigma(index, self._sigma_m)
+        self._frame += 1
+        places = antennas.position_m @ rotation(self._pose[2]).T + self._pose[:2]
+        rows = [
+            (
+                self._frame,
+                scan.radar,
+                range_m,
+                sigma_m,
+                places[scan.radar],
+                antennas.yaw_rad[scan.radar] + self._pose[2],
+                self._pose[2],
+                self._way,
+                pose_index,
+                antennas.nominal_m[scan.radar],
+                antennas.turns_rad[scan.radar],
+            )
+            for scan in scans
+            for range_m, sigma_m in [
+                (math.nan, 0.0),
+                *(
+                    (range_m, scan.sigma(index, self._parameters.ranges.sigma_m))
+                    for index, range_m in enumerate(scan.ranges_m)
+                    if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
+                ),
+            ]
+        ]
+        is_recent = self._rows["frame"] > self._frame - self._parameters.initialisation.long_window
+        kept = self._rows[is_recent]
+        self._rows = np.concatenate([kept, np.array(rows, dtype=_UNASSIGNED)])
 
-    def newest(self, radar: int) -> list[float]:
-        """Return the ranges of a radar in the newest frame."""
-        ranges_m = self._ranges_m[self._newest, radar].tolist()
-        return [range_m for range_m in ranges_m if not math.isnan(range_m)]
+    def newest(self, radar: int) -> list[tuple[int, float, float]]:
+        """Return radar, range and standard deviation [m] of its ranges in the newest frame."""
+        is_newest = (self._rows["frame"] == self._frame) & (self._rows["radar"] == radar)
+        rows = self._rows[is_newest & ~np.isnan(self._rows["range_m"])]
+        return [(radar, *one) for one in rows[["range_m", "sigma_m"]].tolist()]
 
-    def antenna(self, radar: int) -> tuple[float, float, float]:
-        """Return place and yaw of an antenna at the newest frame, in its body frame."""
-        x, y = self._mounts_m[self._newest, radar].tolist()
-        return x, y, float(self._places[self._newest, radar, 2] - self._pose[2])
+    def fit(
+        self, point: BodyPoint, radars: Sequence[int], state: State, *, is_of_ranges: bool = False
+    ) -> FittedRanges | None:
+        """Return which ranges of some radars are of a point, and where they put it.
 
-    def n_frames_with_ranges(self, radar: int, window: int) -> int:
-        """Return how many of the last frames hold any range of a radar."""
-        backs = np.arange(min(window, self._count))
-        some = ~np.isnan(self._ranges_m[self._newest - backs, radar]).all(axis=1)
-        return int(np.count_nonzero(some))
-
-    def follow(
-        self,
-        guess: Guess,
-        search: Search,
-        offsets_m: Array,
-        radar_covariance: Array,
-        limits: Sequence[float],
-    ) -> tuple[Array, Array, Indices, Indices]:
-        """Return what `slam.robust.kernels.follow` does; ``limits`` are its without the drift."""
-        (xx, xy), (_, yy) = guess.covariance.tolist()
-        return kernels.follow(
-            np.array([*guess.target, xx, xy, yy]),
-            self._places,
-            self._poses,
-            self._ways,
-            self._has_frame,
-            self._ranges_m,
-            self._sigmas_m,
-            self._newest,
-            min(search.window, self._count),
-            np.array(search.radars, dtype=np.intp),
-            offsets_m,
-            radar_covariance,
-            np.array([*limits, *self._drifts]),
+        Point and unknowns of the radars are fitted, some times, to the nearest range of each radar
+        in each frame, of those in the gate. A point that is itself of these ranges is where they
+        are looked for at first, and no more. None if they are too few, or hit too few of the frames
+        with the point in view, or do not fit.
+        """
+        rule, noise = self._parameters.initialisation, self._parameters.ranges
+        at = np.flatnonzero(np.isin(self._rows["radar"], radars))
+        looks = self._looks(at, state)
+        of_radars = state.P.block(state.radar_columns)
+        of_radars = np.asarray(np.linalg.inv(of_radars + _FLOOR * np.eye(len(of_radars))))
+        prior = _prior(point, of_radars)
+        known, errors = np.linalg.inv(prior), np.zeros(len(prior))
+        if is_of_ranges:
+            prior = np.pad(of_radars, ((2, 0), (2, 0)))
+            prior[0, 0] = prior[1, 1] = 1.0 / noise.max_range_m**2  # in range, wherever
+        for fits in range(_FITS):
+            residual, J, off = looks.at_point(point.point_m, errors)
+            S = looks.variances + np.sum((J @ known) * J, axis=1)
+            is_near = np.square(residual) <= rule.gate_sigmas**2 * S  # no NaN is
+            is_near &= off <= noise.field_of_view_rad / 2 + rule.edge_rad
+            k = looks.nearest(np.where(is_near, np.abs(residual), math.inf))
+            weighted = J[k].T / looks.variances[k]
+            information = prior + weighted @ J[k]
+            change = weighted @ residual[k] - prior @ errors
+            errors = errors + np.linalg.solve(information, change)
+            if fits == _FITS - 2:  # before the last one
+                known = np.linalg.inv(information)
+        counts = np.unique(looks.rows["radar"][k], return_counts=True)[1]
+        if len(counts) < min(len(radars), 2) or counts.min() < rule.min_hits_per_radar:
+            return None
+        residual, J, off = looks.at_point(point.point_m, errors)
+        if looks.share_hit(k, point.point_m + errors[:2], noise) < rule.min_share:
+            return None
+        chi_square = float(np.sum(np.square(residual[k]) / looks.variances[k]))
+        chi_square += float(errors @ prior @ errors)
+        if not is_plausible(chi_square, len(k)):
+            return None
+        # For the unknowns of the radars as they are in the state
+        covariance = np.asarray(np.linalg.inv(information[:2, :2]))
+        by_offsets = -covariance @ information[:2, 2:]
+        target = point.point_m + errors[:2] - by_offsets @ errors[2:]
+        away = target - looks.antennas_m[k].mean(axis=0)
+        outward = away / max(math.hypot(away[0], away[1]), _LEAST_WAY_M)
+        return FittedRanges(
+            point=BodyPoint(
+                point_m=target, covariance=covariance, by_offsets=by_offsets, outward=outward
+            ),
+            rows=looks.rows[k],
+            at=at[k],
+            chi_square=chi_square,
+            chi_square_of_wall=looks.chi_square_of_wall(k, outward, J[k, 2:], of_radars),
         )
 
-    def sightings(self, members: Indices, offsets_m: Array) -> Sightings:
-        """Return ranges given as (back, radar, index), shape (k, 3), in the newest body frame."""
-        back, radars, index = members.T
-        f = (self._newest - back) % len(self._poses)
-        at = f, radars, index
-        way_m, turn_rad = (self._ways[self._newest] - self._ways[f]).T
-        drift = np.square(self._drifts[0] * way_m) + np.square(self._drifts[1] * turn_rad)
-        places = self._places[f, radars, :2] - self._pose[:2]
-        return Sightings(
-            antennas_m=places @ rotation(self._pose[2]),
-            headings_rad=self._poses[f, 2] - self._pose[2],
-            ranges_m=self._ranges_m[at] - offsets_m[radars],
-            variances=np.square(self._sigmas_m[at]) + drift,
-            radars=radars,
-            poses=self._pose_indices[f],
-            nominal_m=self._nominal_m[f, radars],
-            turns_rad=self._turns_rad[f, radars],
-            measured_m=self._ranges_m[at],
-            sigmas_m=self._sigmas_m[at],
-            n_radars=self._has_frame.shape[1],
+    def _looks(self, at: Indices, state: State) -> _Looks:
+        """Return some rows as they are seen from the newest body frame."""
+        rows = self._rows[at]
+        drifts = (self._way - rows["way"]) * self._drifts
+        return _Looks(
+            rows=rows,
+            antennas_m=(rows["antenna_m"] - self._pose[:2]) @ rotation(self._pose[2]),
+            yaws_rad=rows["yaw_rad"] - self._pose[2],
+            headings_rad=rows["heading_rad"] - self._pose[2],
+            ranges_m=rows["range_m"] - state.offsets_m[rows["radar"]],
+            variances=np.square(rows["sigma_m"]) + np.square(drifts).sum(axis=1),
+            layout=state.layout,
         )
 
-    def use_up(self, members: Indices) -> None:
-        """Take out ranges given as (back, radar, index), shape (k, 3)."""
-        back, radars, index = members.T
-        self._ranges_m[(self._newest - back) % len(self._poses), radars, index] = np.nan
+    def use_up(self, fitted: FittedRanges) -> None:
+        """Take out ranges that were fitted last."""
+        self._rows = np.delete(self._rows, fitted.at)
+
+
+def _prior(point: BodyPoint, of_radars: Array) -> Array:
+    """Return the information on the errors of a point and of the radars' unknowns."""
+    difference = np.hstack([np.eye(2), -point.by_offsets])
+    information = difference.T @ np.linalg.inv(point.covariance) @ difference
+    information[2:, 2:] += of_radars
+    return np.asarray(information)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -469,309 +538,6 @@ def initialise_landmark(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Guess:
-    """Where a target may be, in the newest body frame: mean (2,) and covariance (2, 2)."""
-
-    target: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracklet:
-    """A target at rest in the newest body frame, and the ranges that it explains."""
-
-    target: Array  # shape (2,) [m]
-    covariance: Array  # shape (2, 2), for the unknowns of the radars as in the state
-    by_offsets: Array  # shape (2, q), d(target) / d(unknowns of the radars)
-    members: Indices  # shape (k, 3): (back, radar, index), newest first
-    seen: Sightings  # of the members
-    # Of the residuals
-    chi_square: float
-    dof: int
-
-    def body_point(self) -> BodyPoint:
-        away = self.target - self.seen.antennas_m.mean(axis=0)
-        return BodyPoint(
-            point_m=self.target,
-            covariance=self.covariance,
-            by_offsets=self.by_offsets,
-            outward=away / max(math.hypot(away[0], away[1]), _LEAST_WAY_M),
-        )
-
-    def evidence(self, noise: RangeNoise) -> float:
-        """Return the nats of its ranges, if each radar has one range in every frame.
-
-        They are counted as in `slam.robust.association.weigh_known`.
-        """
-        density = max(noise.clutter_per_m, 1.0 / (noise.max_range_m - noise.min_range_m))
-        log_n = -0.5 * (self.chi_square + float(np.sum(np.log(math.tau * self.seen.variances))))
-        return log_n + len(self.members) * math.log(noise.detection_probability / density)
-
-
-def point_guesses(
-    unassigned: UnassignedRanges, radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
-) -> list[Guess]:
-    """Return the fixes of all pairs of new ranges."""
-    guesses = []
-    spread = rule.prior_sigma_m**2 * np.eye(2)
-    limit = noise.field_of_view_rad / 2 + rule.edge_rad
-    for one, two in combinations(radars, 2):
-        first, second = unassigned.antenna(one), unassigned.antenna(two)
-        for a, b in product(unassigned.newest(one), unassigned.newest(two)):
-            for x, y in crossings(first, second, a, b) or ():
-                if all(
-                    abs(math.remainder(math.atan2(y - at[1], x - at[0]) - at[2], math.tau)) <= limit
-                    for at in (first, second)
-                ):
-                    guesses.append(Guess(target=np.array([x, y]), covariance=spread))
-    return guesses
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
-    """Where tracklets are looked for, and what they must hold."""
-
-    radars: Sequence[int]  # those of one side
-    window: int  # frames looked back
-    min_frames: int  # distinct ones
-
-
-class Tracker:
-    """Follows guesses of points back in time.
-
-    ``offsets_m`` (r,) and ``radar_covariance`` (q, q) are of the unknowns of the radars in the
-    state: r offsets and, where they are unknown, r places of antennas.
-    """
-
-    def __init__(
-        self, parameters: BackEndParameters, offsets_m: Array, radar_covariance: Array
-    ) -> None:
-        self._noise, self._rule = parameters.ranges, parameters.tracklets
-        self._offsets_m, self._radar_covariance = offsets_m, np.ascontiguousarray(radar_covariance)
-        half_view = self._noise.field_of_view_rad / 2
-        self._limits = (
-            half_view,
-            half_view + self._rule.edge_rad,
-            self._noise.min_range_m,
-            self._noise.max_range_m,
-            self._rule.gate_sigmas**2,
-        )
-        least = (_KNOWN_SHARE * self._noise.sigma_m) ** 2
-        # None where the unknowns of the radars are as good as known
-        self._free_covariance: Array | None = self._radar_covariance
-        if float(radar_covariance.diagonal().max(initial=0.0)) <= least:
-            self._free_covariance = None
-
-    def find(
-        self,
-        guesses: Sequence[Guess],
-        unassigned: UnassignedRanges,
-        search: Search,
-        accepts: Callable[[Tracklet], bool] | None = None,
-    ) -> list[Tracklet]:
-        """Return the tracklets of some guesses, best first; their ranges are used up.
-
-        ``accepts`` is the last test of each. They compete by what their ranges are worth less
-        chi-square.
-        """
-        rule = self._rule
-        held = [unassigned.n_frames_with_ranges(radar, search.window) for radar in search.radars]
-        if min(held) < rule.min_hits_per_radar:
-            return []
-        found: list[Tracklet] = []
-        waiting = list(guesses)
-        while waiting:
-            followed = []
-            for guess in waiting:
-                tracklet = self.follow(guess, unassigned, search)
-                if tracklet is not None and (accepts is None or accepts(tracklet)):
-                    followed.append((tracklet, guess))
-            if not followed:
-                break
-            best, chosen = max(
-                followed, key=lambda pair: rule.dof_worth * pair[0].dof - pair[0].chi_square
-            )
-            unassigned.use_up(best.members)
-            found.append(best)
-            # What is left may have lost its ranges: follow it again.
-            waiting = [guess for _, guess in followed if guess is not chosen]
-        return found
-
-    def follow(self, guess: Guess, unassigned: UnassignedRanges, search: Search) -> Tracklet | None:
-        """Return the ranges that follow a guess, or None if they do not suffice."""
-        found, by_offsets, members, hits = unassigned.follow(
-            guess, search, self._offsets_m, self._radar_covariance, self._limits
-        )
-        x, y, xx, xy, yy, chi_square, in_view, hit = found.tolist()
-        counts = [n for n in hits.tolist() if n]
-        if hit < search.min_frames or len(counts) < min(len(search.radars), 2):
-            return None
-        if min(counts) < self._rule.min_hits_per_radar:
-            return None
-        if hit < self._rule.min_share * in_view:
-            return None
-        tracklet = Tracklet(
-            target=np.array([x, y]),
-            covariance=np.array([[xx, xy], [xy, yy]]),
-            by_offsets=by_offsets,
-            members=members,
-            seen=unassigned.sightings(members, self._offsets_m),
-            chi_square=chi_square,
-            dof=len(members) - 2,
-        )
-        if self._free_covariance is not None:
-            tracklet = self._with_free_radars(tracklet, guess.covariance)
-        if not is_plausible(tracklet.chi_square, tracklet.dof):
-            return None
-        return tracklet
-
-    def _with_free_radars(self, tracklet: Tracklet, spread: Array) -> Tracklet:
-        """Judge the members by a target *and* the radars' common unknowns, which are uncertain.
-
-        For the filter, the uncertainty of an offset is noise of each range. It is one number: a
-        target may miss all ranges alike. The target is returned for the unknowns of the state,
-        moved along d(target) / d(unknowns) from the least-squares solution.
-        """
-        fit = fit_law(tracklet.seen, tracklet.target, point_law, self._free_covariance)
-        weighted = fit.by_law.T / tracklet.seen.variances
-        covariance = np.asarray(np.linalg.inv(weighted @ fit.by_law + np.linalg.inv(spread)))
-        by_offsets = np.zeros((2, len(self._radar_covariance)))
-        by_offsets[:, fit.columns] = -covariance @ weighted @ fit.extra
-        return replace(
-            tracklet,
-            target=fit.target - by_offsets[:, fit.columns] @ fit.unknowns,
-            covariance=covariance,
-            by_offsets=by_offsets,
-            chi_square=fit.chi_square,
-        )
-
-    def excess_of_wall(self, tracklet: Tracklet) -> float:
-        """Return by how much chi-square is larger under the law of a wall than under a point's."""
-        x, y = tracklet.target - tracklet.seen.antennas_m.mean(axis=0)
-        point, wall = compare(tracklet.seen, math.atan2(y, x), self._free_covariance)
-        return wall - point
-
-
-Law: TypeAlias = Callable[[Array, Array], tuple[Array, Array, Array]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
-    """A law of least chi-square."""
-
-    target: Array  # shape (2,)
-    unknowns: Array  # shape (p,), errors of those of the radars that took part
-    columns: Indices  # shape (p,): which these are
-    chi_square: float  # of the residuals and of the unknowns
-    # d(range) / d(target), shape (k, 2), and d(range) / d(unknowns), shape (k, p)
-    by_law: Array
-    extra: Array
-
-
-def point_law(target: Array, antennas_m: Array) -> tuple[Array, Array, Array]:
-    """Return ranges (k,), their derivatives by the point (k, 2), and directions (k, 2)."""
-    away = target - antennas_m
-    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
-    u = away / distance[:, None]
-    return distance, u, u
-
-
-def wall_law(target: Array, antennas_m: Array) -> tuple[Array, Array, Array]:
-    """Return ranges (k,), their derivatives by phi and d (k, 2), and directions (k, 2)."""
-    c, s = math.cos(float(target[0])), math.sin(float(target[0]))
-    by_angle = s * antennas_m[:, 0] - c * antennas_m[:, 1]
-    distance = float(target[1]) - c * antennas_m[:, 0] - s * antennas_m[:, 1]
-    directions = np.broadcast_to(np.array([c, s]), antennas_m.shape)
-    return distance, np.column_stack([by_angle, np.ones(len(antennas_m))]), directions
-
-
-def fit_law(seen: Sightings, start: Array, law: Law, radar_covariance: Array | None = None) -> Fit:
-    """Return a law at its least chi-square: Gauss-Newton, steps halved until it falls.
-
-    ``radar_covariance`` is of the unknowns of the radars; None where they are known.
-    """
-    target = start
-    by_target, directions = law(target, seen.antennas_m)[1:]
-    columns, extra, prior = _radar_part(seen, directions, radar_covariance)
-    unknowns = np.zeros(len(columns))
-
-    def chi_square(target: Array, unknowns: Array) -> float:
-        residual = seen.ranges_m - law(target, seen.antennas_m)[0] - extra @ unknowns
-        return float(residual @ (residual / seen.variances) + unknowns @ prior @ unknowns)
-
-    best = chi_square(target, unknowns)
-    for _ in range(_STEPS):
-        distance, by_target, _ = law(target, seen.antennas_m)
-        residual = seen.ranges_m - distance - extra @ unknowns
-        J = np.hstack([by_target, extra])
-        weighted = J.T / seen.variances
-        information, gradient = weighted @ J, weighted @ residual
-        information[2:, 2:] += prior
-        gradient[2:] -= prior @ unknowns
-        information += _DAMPING * np.diag(information.diagonal() + 1.0)
-        change = np.linalg.solve(information, gradient)
-        share = 1.0
-        while share > _LEAST_SHARE:
-            moved = target + share * change[:2], unknowns + share * change[2:]
-            value = chi_square(*moved)
-            if value <= best:
-                break
-            share *= 0.5
-        else:
-            break
-        decrease, best = best - value, value
-        target, unknowns = moved
-        if decrease < _LEAST_DECREASE:
-            break
-    return Fit(
-        target=target,
-        unknowns=unknowns,
-        columns=columns,
-        chi_square=best,
-        by_law=law(target, seen.antennas_m)[1],
-        extra=extra,
-    )
-
-
-def compare(
-    seen: Sightings, toward_rad: float, radar_covariance: Array | None = None
-) -> tuple[float, float]:
-    """Return the least chi-square of the same ranges under the law of a point, and of a wall.
-
-    ``toward_rad`` is roughly the direction of the target, in the frame of the antennas.
-    """
-    middle, range_m = seen.antennas_m.mean(axis=0), float(seen.ranges_m.mean())
-    n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
-    point = fit_law(seen, middle + range_m * n, point_law, radar_covariance)
-    start = np.array([toward_rad, range_m + float(n @ middle)])
-    return point.chi_square, fit_law(seen, start, wall_law, radar_covariance).chi_square
-
-
-def _radar_part(
-    seen: Sightings, directions: Array, covariance: Array | None
-) -> tuple[Indices, Array, Array]:
-    """Return columns (p,), d(range) / d(unknowns) (k, p) and information (p, p) of the radars.
-
-    Directions from antenna to target, (k, 2), are those of the first guess: over a few frames they
-    hardly change.
-    """
-    k = len(seen.ranges_m)
-    if covariance is None:
-        return np.zeros(0, dtype=np.intp), np.zeros((k, 0)), np.zeros((0, 0))
-    used = np.unique(seen.radars)
-    is_of = (seen.radars[:, None] == used).astype(np.float64)
-    columns, extra, n_radars = used, is_of, seen.n_radars
-    if len(covariance) > n_radars:
-        c, s = np.cos(seen.headings_rad), np.sin(seen.headings_rad)
-        x, y = directions.T
-        by_x, by_y = is_of * -(x * c + y * s)[:, None], is_of * (x * s - y * c)[:, None]
-        columns = np.concatenate([used, n_radars + 2 * used, n_radars + 2 * used + 1])
-        extra = np.hstack([is_of, by_x, by_y])
-    known = covariance[np.ix_(columns, columns)] + _FLOOR * np.eye(len(columns))
-    return columns, extra, np.asarray(np.linalg.inv(known))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointDetection:
     """A detection with range and bearing, as measured."""
 
@@ -867,6 +633,56 @@ def body_point(
         by_offsets=by_radar,
         outward=turn[:, 0],
     )
+
+
+def crossing(
+    state: State,
+    antennas: Antennas,
+    ranges: Sequence[tuple[int, float, float]],
+    parameters: BackEndParameters,
+    pose: int,
+) -> list[tuple[PointDetection, BodyPoint]]:
+    """Return the points in view at which two ranges cross, as detections of the first one's radar.
+
+    ``ranges`` are given as radar, range and standard deviation [m]; ``pose`` is that of their
+    scans. Source: paper, equations of trilateration.
+    """
+    (first, range_m, sigma_m), (second, _, other_sigma_m) = ranges
+    radars = np.array([first, second])
+    true_m = np.array([one[1] for one in ranges]) - state.offsets_m[radars]
+    places, yaws_rad = antennas.position_m[radars], antennas.yaw_rad[radars]
+    turns_rad = antennas.turns_rad[radars]
+    limit = parameters.ranges.field_of_view_rad / 2 + parameters.initialisation.edge_rad
+    found = []
+    for x_y in crossings(*places.tolist(), *true_m.tolist()) or ():
+        away = np.array(x_y) - places
+        bearings = np.arctan2(away[:, 1], away[:, 0])
+        u = away / np.hypot(away[:, 0], away[:, 1])[:, None]
+        if np.abs(wrap_angles(bearings - yaws_rad)).max() > limit or not np.linalg.det(u):
+            continue
+        J = np.linalg.inv(u)
+        by_radars = -J @ state.layout.ranges_by_radars(u, turns_rad, radars)
+        # As if the unknowns of the radars were noise: a point that errs with them is not at rest.
+        unknown = by_radars @ state.P.block(state.radar_columns) @ by_radars.T
+        covariance = (J * np.square([sigma_m, other_sigma_m])) @ J.T + unknown
+        across = np.array([-u[0, 1], u[0, 0]])
+        x_m, y_m = antennas.nominal_m[first].tolist()
+        detection = PointDetection(
+            radar=first,
+            label=None,
+            pose=pose,
+            nominal_m=(x_m, y_m),
+            turn_rad=float(turns_rad[0]),
+            range_m=range_m,
+            sigma_m=sigma_m,
+            bearing_rad=float(bearings[0] - turns_rad[0]),
+            bearing_sigma_rad=math.sqrt(float(across @ covariance @ across)) / range_m,
+        )
+        point = BodyPoint(
+            point_m=np.array(x_y), covariance=covariance, by_offsets=by_radars, outward=u[0]
+        )
+        found.append((detection, point))
+    return found
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -972,7 +788,7 @@ class TentativePoints:
 
     def take(self, seen: Sequence[PointDetection], points: Sequence[BodyPoint]) -> None:
         """Take in the detections of a scan, with their points."""
-        rule, waiting = self._parameters.tracklets, self._points
+        rule, waiting = self._parameters.initialisation, self._points
         chosen = self._assigned(seen, points)
         hit = set(chosen.values())
         for k, (detection, point) in enumerate(zip(seen, points, strict=True)):

@@ -69,7 +69,7 @@ class RangeNoise:
     # a match competes with
     unmapped_per_m2: float = 0.02
     # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
-    # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
+    # neighbour's echo may shift it by so much. Ranges of nothing known keep it.
     association_sigma_m: float = 0.0
     # Innovations of more standard deviations weigh less, as in Huber's estimator
     huber_sigmas: float = math.inf
@@ -122,33 +122,29 @@ class ContinuationRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackletRule:
-    """When ranges that continue nothing are evidence of one point at rest."""
+class InitialisationRule:
+    """When detections of nothing known are of one point at rest, which is a new landmark."""
 
     window: Annotated[int, Origin.BUDGET, "frames"] = 15
-    """How far back the ranges of a new landmark are looked for; the paper's window."""
+    """For how many scans a new point is kept that none of them shows; the paper's window."""
     min_share: Annotated[float, Origin.CHOSEN] = 0.6
     """Least share of the frames with a point in view that must hit it, and of the window that must
     be such frames; 9 of 15 are the paper's."""
     min_hits_per_radar: Annotated[int, Origin.CHOSEN, "ranges"] = 4
-    """Fewest ranges of each radar."""
-    prior_sigma_m: Annotated[float, Origin.CHOSEN] = 0.3
-    """Spread of a point about a first fix."""
+    """Fewest ranges of each radar, and detections with bearings, of a landmark."""
     gate_sigmas: Annotated[float, Origin.QUANTILE] = 3.0
     """How far from its prediction a range may lie, in standard deviations: 99.7 % of normal errors
-    are less. Further off, it is no member of a tracklet, a landmark is missed in spite of it, and
-    it counts as this far off where noise is learned. As far outside the limits of range a landmark
-    may lie and still be looked for."""
+    are less. Further off, a new landmark is not fitted to it, a landmark is missed in spite of it,
+    and it counts as this far off where noise is learned. As far outside the limits of range a
+    landmark may lie and still be looked for."""
     drift_share: Annotated[float, Origin.CHOSEN] = 0.7
     """Share of the wheels' scale error by which a frame grows uncertain with the way back to it; a
     radian counts as `WheelNoise.walk_lever_m`."""
-    dof_worth: Annotated[float, Origin.CHOSEN] = 4.0
-    """What one more range is worth against chi-square where tracklets compete for ranges."""
     edge_rad: Annotated[float, Origin.CHOSEN] = 0.1
-    """Half the width of the edge of the field of view: a first fix or a range from further outside
-    is no member of a tracklet, and a landmark must lie further inside to be missed."""
+    """Half the width of the edge of the field of view: what lies further outside has no range, and
+    a landmark must lie further inside to be missed."""
     long_window: Annotated[int, Origin.BUDGET, "frames"] = 40
-    """How far back single ranges are looked for of a point that patches show."""
+    """How far back a new landmark is fitted to single ranges."""
 
     @property
     def min_frames(self) -> int:
@@ -162,7 +158,7 @@ class MapRule:
 
     A landmark's existence score rises by one for every frame that hits it, and falls for every
     frame that should have hit it and did not. It is reported when it has been hit in as many frames
-    as a new one of two radars (`TrackletRule.min_frames`).
+    as a new one of two radars (`InitialisationRule.min_frames`).
     """
 
     look_every: Annotated[int, Origin.BUDGET, "scans"] = 5
@@ -320,7 +316,7 @@ class BranchRule:
     most_places: Annotated[int, Origin.BUDGET, "places"] = 4
     """How many places are on trial at a time."""
     patience: Annotated[int, Origin.BUDGET] = 4
-    """After how many times `TrackletRule.window` a place on trial is dropped."""
+    """After how many times `InitialisationRule.window` a place on trial is dropped."""
     snapshot_every: Annotated[int, Origin.BUDGET, "scans"] = 50
     """Scans between two snapshots of the back end."""
     snapshots: Annotated[int, Origin.BUDGET, "copies"] = 9
@@ -435,7 +431,7 @@ class BackEndParameters:
     wheels: WheelNoise = field(default_factory=WheelNoise)
     ranges: RangeNoise = field(default_factory=RangeNoise)
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
-    tracklets: TrackletRule = field(default_factory=TrackletRule)
+    initialisation: InitialisationRule = field(default_factory=InitialisationRule)
     map: MapRule = field(default_factory=MapRule)
     walls: WallRule = field(default_factory=WallRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)
@@ -458,6 +454,6 @@ class BackEndParameters:
         return BearingRule(
             unmapped_per_m2=self.ranges.unmapped_per_m2,
             frames_per_scan=1,
-            fewest=self.tracklets.min_hits_per_radar,
-            if_unclear=self.tracklets.min_frames,
+            fewest=self.initialisation.min_hits_per_radar,
+            if_unclear=self.initialisation.min_frames,
         )

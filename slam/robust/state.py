@@ -295,6 +295,21 @@ class Layout:
         first = HEAD_SIZE + self.n_radars
         return slice(first, first + 2 * self.n_radars * self.has_mounts)
 
+    def ranges_by_radars(self, directions: Array, headings_rad: Array, radars: Indices) -> Array:
+        """Return d(range) / d(unknowns of the radars), (k, q), of k ranges.
+
+        Given are the directions to what was ranged, (k, 2), the robot's headings in their frame
+        (k,), and of which radar each is (k,).
+        """
+        is_of = np.equal.outer(radars, np.arange(self.n_radars)).astype(np.float64)
+        if not self.has_mounts:
+            return is_of
+        c, s = np.cos(headings_rad), np.sin(headings_rad)
+        x, y = directions.T
+        by_place = -np.column_stack([c * x + s * y, c * y - s * x])
+        by_mounts = is_of[:, :, None] * by_place[:, None, :]
+        return np.hstack([is_of, by_mounts.reshape(len(radars), 2 * self.n_radars)])
+
     @property
     def landmark_size(self) -> int:
         return 3 if self.has_radii else 2

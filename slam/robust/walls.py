@@ -31,8 +31,6 @@ from slam.robust.initialisation import (
     BodyTarget,
     FeatureRows,
     PointDetection,
-    Tracker,
-    Tracklet,
     certain_row,
     fused,
 )
@@ -299,7 +297,7 @@ class TentativeWalls:
             shown.append(one)
         for one in free:
             one.misses += 1
-        fewest, window = self._parameters.imaged.new_patches, self._parameters.tracklets.window
+        fewest, window = self._parameters.imaged.new_patches, self._parameters.initialisation.window
         self._walls = [one for one in free if one.misses <= window]
         self._walls += [one for one in shown if len(one.seen) < fewest]
         return [one for one in shown if len(one.seen) >= fewest]
@@ -343,34 +341,6 @@ class WallKeeper:
                 if not self.cells.surrounds(wall_id, place):
                     off[radar, n + row] = math.pi
         return replace(seen, off_boresight_rad=off)
-
-    def is_point(self, tracklet: Tracklet) -> bool:
-        """Return whether the ranges of a tracklet follow a point's law rather than a wall's.
-
-        What goes on where a mapped wall does is not known to be a point yet: over a few frames both
-        laws fit.
-        """
-        return self.tracker().excess_of_wall(tracklet) >= 0.0 and not self._is_on_a_wall(tracklet)
-
-    def _is_on_a_wall(self, tracklet: Tracklet) -> bool:
-        """Return whether a mapped wall nearby explains the ranges, too."""
-        state, rule, seen = self._state, self._rule, tracklet.seen
-        for row, wall_id in enumerate(state.wall_ids):
-            phi, d = (float(value) for value in state.walls[row])
-            n = np.array([np.cos(phi - state.heading_rad), np.sin(phi - state.heading_rad)])
-            depth = d - float(state.position_m @ np.array([np.cos(phi), np.sin(phi)]))
-            ranges = depth - seen.antennas_m @ n
-            if np.abs(seen.ranges_m - ranges).max() > rule.resolution_m:
-                continue
-            feet = seen.antennas_m + ranges[:, None] * n
-            places = state.position_m + feet @ rotation(state.heading_rad).T
-            if self.cells.is_near(wall_id, along_wall(state, row, places), rule.reach_m):
-                return True
-        return False
-
-    def tracker(self) -> Tracker:
-        state = self._state
-        return Tracker(self._parameters, state.offsets_m, state.P.block(state.radar_columns))
 
     def take(
         self, faces: Sequence[Face], antennas: Antennas

@@ -20,7 +20,7 @@ from slam.app.run.runner import execute
 from slam.app.session.constants import slam_constants
 from slam.live.session.reader import open_session
 from slam.live.session_records import Snapshot
-from slam.robust.parameters import BackEndParameters, TrackletRule
+from slam.robust.parameters import BackEndParameters, InitialisationRule
 from xethru_protocol.operating_system import StopFlag
 
 pytestmark = pytest.mark.slow
@@ -205,9 +205,9 @@ def test_a_run_with_other_rules_is_replayed_with_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a session of another version is, whose rules are not those of this one."""
-    name = "slam.robust.parameters.TrackletRule.window"
+    name = "slam.robust.parameters.InitialisationRule.window"
     constants = slam_constants() | {name: 21, "slam.robust.map.MERGE_SIGMA_M": 9.0}
-    rules = BackEndParameters(tracklets=TrackletRule(window=21))
+    rules = BackEndParameters(initialisation=InitialisationRule(window=21))
     session = tmp_path / "session.mcap"
     record_session(session, "robust", rules=rules, constants=constants)
     assert main(["replay", str(session), "--out", str(tmp_path / "out")]) == 0

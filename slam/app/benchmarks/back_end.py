@@ -17,13 +17,13 @@ from slam.robust.association import RangeScan
 from slam.robust.branches import Hypotheses
 from slam.robust.parameters import (
     BackEndParameters,
+    InitialisationRule,
     JumpNoise,
     LagRule,
     MapRule,
     NoiseRule,
     RangeNoise,
     RelinearisationRule,
-    TrackletRule,
 )
 from xethru_protocol.operating_system import StopFlag
 
@@ -100,7 +100,7 @@ def parameters_of(sensor: Sensor) -> BackEndParameters:
             min_range_m=sensor.min_range_m,
             max_range_m=sensor.max_range_m,
         ),
-        tracklets=TrackletRule(min_share=sensor.new_share),
+        initialisation=InitialisationRule(min_share=sensor.new_share),
         map=MapRule(neighbourhood_m=sensor.neighbourhood_m),
         noise=NoiseRule(aspect_rad=0.0) if sensor.is_optical else NoiseRule(),
         relinearisation=RelinearisationRule(key_m=sensor.shift_m, shift_m=sensor.shift_m),

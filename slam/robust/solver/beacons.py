@@ -145,7 +145,7 @@ def initialise_beacon(
         return None
     mine = best.problem.range_landmarks == best.row
     residual = measurement_residuals(best.problem, best.solution.estimate).residual[: len(mine)]
-    if _share_that_fits(residual[mine], parameters) < parameters.tracklets.min_share:
+    if _share_that_fits(residual[mine], parameters) < parameters.initialisation.min_share:
         return None
     landmark_id = _augmented(state, best.point_m)
     log.rename(log_id, landmark_id)
@@ -158,7 +158,7 @@ def is_heard_where_it_is(
     log: RunLog, state: State, row: int, parameters: BackEndParameters
 ) -> bool:
     """Return whether enough of the newest ranges of a beacon fit its place; after a solution."""
-    rule, problem = parameters.tracklets, log.problem(state, parameters)
+    rule, problem = parameters.initialisation, log.problem(state, parameters)
     mine = np.flatnonzero(problem.range_landmarks == row)[-rule.min_frames :]
     residual = measurement_residuals(problem, log.starts(state, problem)[0]).residual[mine]
     return _share_that_fits(residual, parameters) >= rule.min_share

@@ -403,7 +403,7 @@ def learn_noise(
         if id_ in state.wall_ids:
             own[row] = max(own[row], parameters.walls.roughness_m)
         state.added_sigmas_m[id_] = own[row]
-    sigmas_m, most_sigmas = np.hypot(given_m, own[at]), parameters.tracklets.gate_sigmas
+    sigmas_m, most_sigmas = np.hypot(given_m, own[at]), parameters.initialisation.gate_sigmas
     white = np.clip(ratio * given_m / sigmas_m, -most_sigmas, most_sigmas)
     alike = np.column_stack([at, block])
     if rule.aspect_rad > 0.0:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import between, compose, wrap_angle, wrap_angles
-from slam.robust.initialisation import PointDetection, Sightings, median_radius
+from slam.robust.initialisation import PointDetection, median_radius
 from slam.robust.map import SURE, MapPrior, fixed_values
 from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.solver.growing_arrays import PackedRows
@@ -327,24 +327,18 @@ class RunLog:
                 radius_sigma_m=one.radius_sigma_m,
             )
 
-    def add_sightings(self, landmark_id: int, seen: Sightings) -> None:
-        for pose, radar, antenna, turn_rad, range_m, sigma_m in zip(
-            seen.poses.tolist(),
-            seen.radars.tolist(),
-            seen.nominal_m.tolist(),
-            seen.turns_rad.tolist(),
-            seen.measured_m.tolist(),
-            seen.sigmas_m.tolist(),
-            strict=True,
-        ):
+    def add_unassigned(self, landmark_id: int, rows: NDArray[np.void]) -> None:
+        """Append ranges that were of nothing known, in rows as `UnassignedRanges` has them."""
+        for row in rows:
+            x_m, y_m = row["nominal_m"].tolist()
             self.add_range(
-                pose,
-                radar,
+                int(row["pose"]),
+                int(row["radar"]),
                 landmark_id,
-                antenna=(antenna[0], antenna[1]),
-                turn_rad=turn_rad,
-                range_m=range_m,
-                sigma_m=sigma_m,
+                antenna=(x_m, y_m),
+                turn_rad=float(row["turn_rad"]),
+                range_m=float(row["range_m"]),
+                sigma_m=float(row["sigma_m"]),
             )
 
     def is_new_passage(self, landmark_id: int) -> bool:

@@ -502,7 +502,7 @@ def test_impossible_ranges_have_no_fix(first_m: float, second_m: float) -> None:
     st.integers(0, 3),
 )
 def test_impossible_ranges_change_nothing(nonsense: list[float], radar: int) -> None:
-    """Neither a landmark nor a tracklet comes of them, and good ranges beside them count."""
+    """No landmark comes of them, and good ranges beside them count."""
     back_end = deepcopy(LONE)
     good = [
         float(np.hypot(0.0 - mount.x_m - back_end.state.position_m[0], 1.0 - mount.y_m))

@@ -375,8 +375,6 @@ def test_evidence_is_the_likelihood_of_the_ranges() -> None:
         hits, missed = report.evidence[: report.dof], report.evidence[report.dof :]
         assert [id_ for id_, _ in hits] == [id_ for _, _, id_ in report.continued]
         for id_, nats in missed:
-            if nats > 0.0:  # of a tracklet
-                continue
             n_missed = PRIOR_LOOKS * (1 - noise.detection_probability) + unheard[id_]
             looks = PRIOR_LOOKS + heard[id_] + unheard[id_]
             assert nats == pytest.approx(math.log(n_missed / looks))

@@ -1,6 +1,7 @@
-"""Tracklets, initialisation from one radar, weights of ranges."""
+"""Ranges of nothing known, where they cross, and what new landmarks are fitted to; weights."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,33 +22,30 @@ from slam.geometry import compose, paper_rig
 from slam.robust import kernels
 from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import (
-    Guess,
-    Search,
-    Tracker,
-    Tracklet,
-    UnassignedRanges,
-    point_guesses,
-)
-from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule
-from slam.robust.state import Array, calibrated_motion
+from slam.robust.initialisation import BodyPoint, UnassignedRanges, crossing
+from slam.robust.parameters import BackEndParameters, InitialisationRule, RangeNoise
+from slam.robust.state import Array, State, calibrated_motion
 
 SIGMA_M = 5e-3
-NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), TrackletRule()
-PARAMETERS = BackEndParameters(ranges=NOISE, tracklets=RULE)
+NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), InitialisationRule()
+PARAMETERS = BackEndParameters(ranges=NOISE, initialisation=RULE)
 LEFT = (0, 1)
-SEARCH = Search(radars=LEFT, window=15, min_frames=RULE.min_frames)
+STEP_M, N_FRAMES = 0.02, 15
+
+
+def state_of(offset_sigma_m: float = 0.0, mount_sigma_m: float = 0.0) -> State:
+    return State((0.0, 0.0, 0.0), (offset_sigma_m,) * 4, mount_sigma_m, 0.0)
 
 
 def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> UnassignedRanges:
     """Return 15 frames of 2 cm past targets on the left; moving ones go with the robot."""
     rng = np.random.default_rng(1)
-    unassigned = UnassignedRanges(15, 4, SIGMA_M, 0.005, 0.0015)
-    step = calibrated_motion(np.array([0.02, 0.0, 0.0]), np.zeros(3), WheelNoise())
+    unassigned = UnassignedRanges(PARAMETERS)
+    step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
     mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
-    for k in range(15):
+    for k in range(N_FRAMES):
         unassigned.move(step)
-        body = targets - [0.0 if moving else 0.02 * k, 0.0]
+        body = targets - [0.0 if moving else STEP_M * k, 0.0]
         scans = [
             RangeScan(
                 radar=radar,
@@ -64,47 +62,107 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
     return unassigned
 
 
-def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
-    tracker = Tracker(PARAMETERS, np.zeros(4), offset_sigma_m**2 * np.eye(4))
-    guesses = point_guesses(unassigned, LEFT, NOISE, RULE)
-    return tracker.find(guesses, unassigned, SEARCH)
+WAY = np.array([STEP_M * (N_FRAMES - 1), 0.0])
+"""What targets move by in the body frame, while `driven`."""
 
 
-def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
+def near(point_m: Array, sigma_m: float = 0.03, by_offsets: Array | None = None) -> BodyPoint:
+    """Return a point that is known to so much only."""
+    return BodyPoint(
+        point_m=np.asarray(point_m),
+        covariance=sigma_m**2 * np.eye(2),
+        by_offsets=np.zeros((2, 4)) if by_offsets is None else by_offsets,
+    )
+
+
+def test_ranges_of_a_point_put_it_where_it_is_and_are_used_up() -> None:
     target = np.array([[0.15, 0.9]])
     unassigned = driven(target, np.zeros(4))
-    (found,) = tracklets(unassigned)
-    miss = found.target - (target[0] - [0.28, 0.0])
-    assert miss @ np.linalg.solve(found.covariance, miss) < 13.8
-    assert len(found.members) == 30
-    assert all(unassigned.n_frames_with_ranges(radar, 15) == 0 for radar in LEFT)
-    assert tracklets(unassigned) == []
+    true = target[0] - WAY
+    found = unassigned.fit(near(np.add(true, [0.02, -0.02])), LEFT, state_of())
+    assert found is not None
+    point, rows = found.point, found.rows
+    assert not found.is_flat
+    miss = point.point_m - true
+    assert miss @ np.linalg.solve(point.covariance, miss) < 13.8
+    assert np.all(np.linalg.eigvalsh(point.covariance) < 0.01**2)
+    assert sorted(rows["pose"].tolist()) == sorted([*range(N_FRAMES)] * 2)
+    assert found.n_frames == N_FRAMES
+    unassigned.use_up(found)
+    assert unassigned.newest(0) == unassigned.newest(1) == []
+    assert unassigned.fit(near(true), LEFT, state_of()) is None
 
 
-def test_what_goes_with_the_robot_is_no_tracklet() -> None:
+def test_ranges_of_what_goes_with_the_robot_are_of_no_point_at_rest() -> None:
     fixed = np.array([[0.0, 0.9]])
-    assert tracklets(driven(fixed, np.zeros(4), moving=True)) == []
-    assert tracklets(driven(fixed, np.zeros(4), moving=True), 0.02) == []
+    for offset_sigma_m in (0.0, 0.02):
+        unassigned = driven(fixed, np.zeros(4), moving=True)
+        assert unassigned.fit(near(fixed[0]), LEFT, state_of(offset_sigma_m)) is None
 
 
-def test_of_two_points_four_fixes_and_two_tracklets() -> None:
+def test_of_two_points_each_has_its_own_ranges() -> None:
     targets = np.array([[0.1, 0.8], [0.25, 0.9]])
     unassigned = driven(targets, np.zeros(4))
-    assert len(point_guesses(unassigned, LEFT, NOISE, RULE)) > 2
-    found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.target[1]))
-    assert len(found) == 2
-    for tracklet, target in zip(found, targets, strict=True):
-        assert tracklet.target == pytest.approx(target - [0.28, 0.0], abs=0.03)
+    for target in targets:
+        true = target - WAY
+        found = unassigned.fit(near(np.add(true, 0.01), 0.02), LEFT, state_of())
+        assert found is not None
+        assert len(found.rows) == 2 * N_FRAMES
+        assert found.point.point_m == pytest.approx(true, abs=0.01)
 
 
-def test_uncertain_offsets_cost_no_tracklet() -> None:
+def test_unknown_offsets_are_fitted_with_the_point() -> None:
     """Both radars 30 mm off in opposite directions: no point at rest, unless that may be."""
     target, offsets = np.array([[0.15, 0.6]]), np.array([0.03, -0.03, 0.0, 0.0])
-    assert tracklets(driven(target, offsets)) == []
-    (found,) = tracklets(driven(target, offsets), 0.02)
-    true = target[0] - [0.28, 0.0]
-    corrected = found.target + found.by_offsets @ offsets
-    assert np.hypot(*(corrected - true)) < 0.5 * np.hypot(*(found.target - true))
+    true = target[0] - WAY
+    assert driven(target, offsets).fit(near(true), LEFT, state_of()) is None
+    found = driven(target, offsets).fit(near(true, 0.3), LEFT, state_of(0.02))
+    assert found is not None
+    point = found.point
+    corrected = point.point_m + point.by_offsets @ offsets
+    assert np.hypot(*(corrected - true)) < 0.2 * np.hypot(*(point.point_m - true))
+
+
+FEW = 10
+"""Frames of a wall that are of a point as well, for all that ranges tell."""
+
+
+def ranged(ranges_of: Callable[[Array], float]) -> tuple[UnassignedRanges, Array, Array]:
+    """Return a few frames of exact ranges on a straight way, where they were taken, and them."""
+    parameters = replace(PARAMETERS, wheels=WheelNoise(scale_sigma=0.0))
+    unassigned, places, ranges = UnassignedRanges(parameters), list[Array](), list[float]()
+    step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
+    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
+    for k in range(FEW):
+        unassigned.move(step)
+        at = np.add(mounts, [STEP_M * k, 0.0])
+        scans = [RangeScan(radar=radar, ranges_m=(ranges_of(at[radar]),)) for radar in LEFT]
+        unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
+        places += [at[radar] for radar in LEFT]
+        ranges += [scan.ranges_m[0] for scan in scans]
+    return unassigned, np.array(places), np.array(ranges)
+
+
+def test_what_a_straight_line_fits_as_well_is_a_wall() -> None:
+    """Of a point the line leaves what `numpy.polyfit` leaves of its ranges over the way."""
+    depth_m, way_m = 0.6, STEP_M * (FEW - 1)
+    point = np.array([0.1, depth_m])
+    unassigned, places, ranges_m = ranged(lambda at: float(np.hypot(*(point - at))))
+    found = unassigned.fit(near(point - [way_m, 0.0]), LEFT, state_of())
+    assert found is not None
+    line = np.polyval(np.polyfit(places[:, 0], ranges_m, 1), places[:, 0])
+    left = float(np.sum(np.square(ranges_m - line))) / SIGMA_M**2
+    assert found.chi_square == pytest.approx(0.0, abs=1e-6)
+    assert found.chi_square_of_wall == pytest.approx(left, rel=1e-6)
+    assert left > 1.0
+    assert not found.is_flat
+
+    unassigned, places, _ = ranged(lambda at: float(3.0 * depth_m - at[1]))
+    foot = np.array([places[:, 0].mean() - way_m, 3.0 * depth_m])
+    found = unassigned.fit(near(foot, 0.3), LEFT, state_of(0.02))
+    assert found is not None
+    assert found.chi_square_of_wall == pytest.approx(0.0, abs=1e-6)
+    assert found.is_flat
 
 
 TURNS_RAD = 0.05 * np.arange(12)
@@ -119,10 +177,11 @@ def range_after(turn_rad: float, radar: int, target: Array) -> float:
 
 def test_ranges_from_before_a_turn_are_less_sure_by_the_drift_per_radian() -> None:
     """Closed form: of exact ranges, the information of all, each with its own variance."""
-    drift_per_rad_m, prior_m = 0.02, 0.05
+    wheels, prior_m = WheelNoise(scale_sigma=0.05, walk_lever_m=0.5), 0.05
+    drift_per_rad_m = RULE.drift_share * wheels.scale_sigma * wheels.walk_lever_m
     target = np.array([-0.2, 1.0])
-    unassigned = UnassignedRanges(15, 4, SIGMA_M, 0.0, drift_per_rad_m)
-    step = calibrated_motion(np.array([0.0, 0.0, TURNS_RAD[1]]), np.zeros(3), WheelNoise())
+    unassigned = UnassignedRanges(replace(PARAMETERS, wheels=wheels))
+    step = calibrated_motion(np.array([0.0, 0.0, TURNS_RAD[1]]), np.zeros(3), wheels)
     for k, turn_rad in enumerate(TURNS_RAD):
         if k:
             unassigned.move(step)
@@ -133,51 +192,99 @@ def test_ranges_from_before_a_turn_are_less_sure_by_the_drift_per_radian() -> No
         unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
     c, s = np.cos(TURNS_RAD[-1]), np.sin(TURNS_RAD[-1])
     body = np.array([[c, s], [-s, c]]) @ target
-    limits = [1.0, 1.0, 0.1, 9.0, 9.0]
-    found, _, members, _ = unassigned.follow(
-        Guess(target=body, covariance=prior_m**2 * np.eye(2)),
-        SEARCH,
-        np.zeros(4),
-        np.zeros((4, 4)),
-        limits,
-    )
-    assert len(members) == 2 * len(TURNS_RAD)
-    seen = unassigned.sightings(members, np.zeros(4))
-    since = TURNS_RAD[-1] - TURNS_RAD[seen.poses]
-    variances = SIGMA_M**2 + (drift_per_rad_m * since) ** 2
-    assert seen.variances == pytest.approx(variances, rel=1e-9)
-    away = body - seen.antennas_m
+    found = unassigned.fit(near(body, prior_m), LEFT, state_of())
+    assert found is not None
+    point, rows = found.point, found.rows
+    assert len(rows) == 2 * len(TURNS_RAD)
+    turns_rad = TURNS_RAD[rows["pose"]]
+    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])[rows["radar"]]
+    back = turns_rad - TURNS_RAD[-1]
+    turned = np.array([[np.cos(back), -np.sin(back)], [np.sin(back), np.cos(back)]])
+    away = body - np.einsum("ijk,kj->ki", turned, mounts)
     u = away / np.hypot(*away.T)[:, np.newaxis]
+    variances = SIGMA_M**2 + (drift_per_rad_m * back) ** 2
     information = np.eye(2) / prior_m**2 + (u / variances[:, np.newaxis]).T @ u
-    (xx, xy), (_, yy) = np.linalg.inv(information)
-    assert found[:2] == pytest.approx(body, abs=1e-9)
-    assert found[2:5] == pytest.approx([xx, xy, yy], rel=1e-6)
+    assert point.point_m == pytest.approx(body, abs=1e-9)
+    assert point.covariance == pytest.approx(np.linalg.inv(information), rel=1e-6)
 
 
-def test_a_new_landmark_is_worth_the_densities_of_its_ranges_over_those_of_false_ones() -> None:
-    """On the spot and with exact ranges: the logarithms of N(0; 0, S) and Pd / lambda of each."""
-    wheels = WheelNoise(scale_sigma=0.05, walk_lever_m=0.5)
-    back_end = RobustBackEnd(paper_rig(), replace(PARAMETERS, wheels=wheels))
-    per_rad_m = RULE.drift_share * wheels.scale_sigma * wheels.walk_lever_m
-    per_m = max(NOISE.clutter_per_m, 1.0 / (NOISE.max_range_m - NOISE.min_range_m))
-    target = np.array([-0.2, 1.0])
-    for k, turn_rad in enumerate(TURNS_RAD):
-        back_end.predict(np.array([0.0, 0.0, TURNS_RAD[1] if k else 0.0]))
-        report = back_end.update(
-            [
-                RangeScan(radar=radar, ranges_m=(range_after(turn_rad, radar, target),))
-                for radar in LEFT
-            ]
-        )
-        if report.evidence:
-            break
-    ((landmark_id, nats),) = report.evidence
-    assert back_end.state.landmark_ids == [landmark_id]
-    since = turn_rad - TURNS_RAD[: k + 1]
-    variances = np.repeat(SIGMA_M**2 + (per_rad_m * since) ** 2, len(LEFT))
-    expected = -0.5 * np.log(2.0 * math.pi * variances)
-    expected += math.log(NOISE.detection_probability / per_m)
-    assert nats == pytest.approx(float(expected.sum()), abs=1e-3)
+@pytest.mark.parametrize("mount_sigma_m", [0.0, 5e-3])
+def test_two_ranges_cross_where_their_target_is(mount_sigma_m: float) -> None:
+    """Covariance and derivatives by differences of crossings; one radar was turned meanwhile."""
+    target, sigmas = np.array([0.15, 0.9]), (4e-3, 6e-3)
+    state = state_of(0.01, mount_sigma_m)
+    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
+    turn_rad = 0.1
+
+    def cross(errors: Array) -> BodyPoint:
+        """Return the crossing of two ranges, with errors of them and of the second's mount."""
+        scans = [
+            RangeScan(radar=0, ranges_m=()),
+            RangeScan(radar=1, ranges_m=(), moved=(0.0, 0.0, turn_rad)),
+        ]
+        c, s = math.cos(turn_rad), math.sin(turn_rad)
+        places = [mounts[0], np.array([[c, -s], [s, c]]) @ mounts[1]]
+        antennas = antennas_of(paper_rig(), scans, np.zeros(3), mounts_moved(errors[2:]))
+        ranges = [
+            (radar, float(np.hypot(*(target - places[radar]))) + errors[radar], sigmas[radar])
+            for radar in LEFT
+        ]
+        ((_, point),) = crossing(state, antennas, ranges, PARAMETERS, 0)
+        return point
+
+    def mounts_moved(second: Array) -> Array:
+        return np.array([(0.0, 0.0), second, (0.0, 0.0), (0.0, 0.0)])
+
+    exact = cross(np.zeros(4))
+    assert exact.point_m == pytest.approx(target, abs=1e-9)
+    step = 1e-6
+    by_errors = np.column_stack(
+        [(cross(step * one).point_m - cross(-step * one).point_m) / (2 * step) for one in np.eye(4)]
+    )
+    # What is measured too long by an offset is put right by subtracting it.
+    assert exact.by_offsets[:, :2] == pytest.approx(-by_errors[:, :2], rel=1e-5)
+    unknown = 0.01**2 * by_errors[:, :2] @ by_errors[:, :2].T
+    if mount_sigma_m:
+        assert exact.by_offsets[:, 6:8] == pytest.approx(by_errors[:, 2:], rel=1e-5)
+        of_mounts = exact.by_offsets[:, 4:]
+        unknown = unknown + mount_sigma_m**2 * of_mounts @ of_mounts.T
+    noise = (by_errors[:, :2] * np.square(sigmas)) @ by_errors[:, :2].T
+    assert exact.covariance == pytest.approx(noise + unknown, rel=1e-4)
+
+
+def test_ranges_that_do_not_cross_in_view_have_no_point() -> None:
+    antennas = antennas_of(
+        paper_rig(), [RangeScan(radar=radar, ranges_m=()) for radar in range(4)], np.zeros(3)
+    )
+    state, reach_m = state_of(), 1.0
+    apart_m = 2.0  # the radars of a side are less far apart
+    for radars, ranges_m in (((0, 1), (reach_m, reach_m + apart_m)), ((0, 2), (0.2, 0.2))):
+        ranges = [(radar, m, SIGMA_M) for radar, m in zip(radars, ranges_m, strict=True)]
+        assert crossing(state, antennas, ranges, PARAMETERS, 0) == []
+
+
+def test_where_ranges_cross_scan_after_scan_there_is_a_landmark() -> None:
+    """It has all ranges of before, once: those that led to it are not in the map twice."""
+    back_end = RobustBackEnd(paper_rig(), PARAMETERS)
+    target = np.array([0.15, 0.9])
+    for k in range(N_FRAMES):
+        back_end.predict(np.array([STEP_M if k else 0.0, 0.0, 0.0]))
+        scans = [
+            RangeScan(
+                radar=radar,
+                ranges_m=(range_after(0.0, radar, target - [STEP_M * k, 0.0]),),
+            )
+            for radar in LEFT
+        ]
+        back_end.update(scans)
+        if k == RULE.min_frames - 2:
+            assert not back_end.state.landmark_ids
+    (landmark_id,) = back_end.state.landmark_ids
+    assert back_end.state.landmarks_m[0] == pytest.approx(target, abs=1e-3)
+    assert back_end.n_reported_since(landmark_id) == 1
+    poses = back_end.smoothed(np.arange(N_FRAMES - 1))
+    assert poses is not None
+    assert poses.landmarks_m[0] == pytest.approx(target, abs=1e-3)
 
 
 def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> None:

@@ -274,7 +274,7 @@ def test_detections_that_one_in_a_thousand_points_would_give_are_of_none(
     probability: float, n_found: int
 ) -> None:
     """Of n detections, a point at rest leaves chi-square of 2 (n - 1) degrees of freedom."""
-    n = PARAMETERS.tracklets.min_hits_per_radar
+    n = PARAMETERS.initialisation.min_hits_per_radar
     seen = [
         PointDetection(
             radar=0,

@@ -23,12 +23,10 @@ from slam.robust.association import Antennas, RangeScan, antennas_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
     PointDetection,
-    Sightings,
-    compare,
     detections_of,
 )
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
-from slam.robust.state import Array, Indices, State, SymmetricMatrix, calibrated_motion, predict
+from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion, predict
 from slam.robust.walls import (
     BodyWall,
     TentativeWalls,
@@ -322,7 +320,7 @@ def test_a_wall_that_patches_no_longer_show_is_forgotten() -> None:
     state, parameters = State((0.0,) * 3, OFFSETS), BackEndParameters()
     one = faces_of(state, [faces_from(np.zeros(3), (1.4, 1.5))])
     counts = []
-    for n_others in (0, parameters.tracklets.window, parameters.tracklets.window + 1):
+    for n_others in (0, parameters.initialisation.window, parameters.initialisation.window + 1):
         tentative = TentativeWalls(parameters)
         for faces in (one, *[[]] * n_others):
             assert tentative.take(faces) == []
@@ -484,90 +482,3 @@ def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
     ((phi_rad, _),) = back_end.state.walls
     assert phi_rad == pytest.approx(math.pi / 2, abs=0.01)
     assert back_end.wall_spans_m()[:, :, 0].max() < WALL_END_M + 0.2
-
-
-SHARP_SIGMA_M = 1e-3
-REACH_M = 0.15
-DISTANCE_M = 1.0
-
-
-def places(n: int = 301, reach_m: float = REACH_M) -> Array:
-    """Return places along x, the reflector's side being +y."""
-    return np.column_stack([np.linspace(-reach_m, reach_m, n), np.zeros(n)])
-
-
-def sightings(antennas: Array, ranges: Array, radars: Indices | None = None) -> Sightings:
-    k = len(ranges)
-    return Sightings(
-        antennas_m=antennas,
-        headings_rad=np.zeros(k),
-        ranges_m=ranges,
-        variances=np.full(k, SHARP_SIGMA_M**2),
-        radars=np.zeros(k, dtype=np.intp) if radars is None else radars,
-        poses=np.arange(k),
-        nominal_m=np.zeros((k, 2)),
-        turns_rad=np.zeros(k),
-        measured_m=ranges,
-        sigmas_m=np.full(k, SHARP_SIGMA_M),
-        n_radars=2,
-    )
-
-
-def bulge() -> float:
-    """Return the chi-square that x^2 / 2 D leaves when a straight line is fitted to it.
-
-    A point at D is at D + x^2 / 2 D, to second order; a straight line takes up the mean. With x
-    uniform in +-a the rest has the variance (a^4 / 5 - a^4 / 9) / 4 D^2.
-    """
-    a = REACH_M
-    return len(places()) * (a**4 / 5 - a**4 / 9) / (4 * DISTANCE_M**2 * SHARP_SIGMA_M**2)
-
-
-def test_each_law_leaves_the_bulge_of_a_hyperbola_in_ranges_of_the_other() -> None:
-    antennas = places()
-    point, wall = compare(sightings(antennas, np.hypot(antennas[:, 0], DISTANCE_M)), math.pi / 2)
-    assert point == pytest.approx(0.0, abs=1e-6)
-    assert wall == pytest.approx(bulge(), rel=0.03)
-    point, wall = compare(sightings(antennas, np.full(len(antennas), DISTANCE_M)), math.pi / 2)
-    assert wall == pytest.approx(0.0, abs=1e-6)
-    assert point == pytest.approx(bulge(), rel=0.03)
-
-
-def test_a_wall_aslant_is_a_wall() -> None:
-    antennas = places()
-    antennas[:, 1] = 0.3 + 2.0 * antennas[:, 0] ** 2
-    n = np.array([math.cos(1.9), math.sin(1.9)])
-    point, wall = compare(sightings(antennas, 1.1 - antennas @ n), 1.7)
-    assert wall == pytest.approx(0.0, abs=1e-6)
-    assert point > 30.0
-
-
-def test_little_displacement_decides_nothing() -> None:
-    """The bulge goes with the fourth power of the displacement."""
-    antennas = places(reach_m=REACH_M / 10)
-    point, wall = compare(sightings(antennas, np.hypot(antennas[:, 0], DISTANCE_M)), math.pi / 2)
-    assert wall == pytest.approx(bulge() / 1e4, rel=0.03)
-    assert abs(point - wall) < 1.0
-
-
-def test_unknown_offsets_of_two_radars_turn_a_wall_but_make_no_point_of_it() -> None:
-    along = places()
-    antennas = np.vstack([np.subtract(along, [0.1, 0.0]), np.add(along, [0.1, 0.0])])
-    radars = np.repeat([0, 1], len(along))
-    ranges_m = DISTANCE_M + np.array([0.015, -0.02])[radars]
-    covariance = 0.02**2 * np.eye(2)
-    point, wall = compare(sightings(antennas, ranges_m, radars), math.pi / 2, covariance)
-    assert wall < 2.0  # what the prior of the offsets asks for 15 and 20 of 20 mm
-    assert point - wall > 30.0
-
-
-def test_a_corner_is_a_point_at_its_apex() -> None:
-    """By way of both walls the antenna's image is the antenna turned about the apex."""
-    apex = np.array([0.3, 0.9])
-    antennas = places()
-    first = np.column_stack([antennas[:, 0], 2 * apex[1] - antennas[:, 1]])
-    image = np.column_stack([2 * apex[0] - first[:, 0], first[:, 1]])
-    ranges = np.hypot(*(image - antennas).T) / 2
-    point, wall = compare(sightings(antennas, ranges), math.atan2(apex[1], apex[0]))
-    assert point == pytest.approx(0.0, abs=1e-6)
-    assert wall > 30.0

@@ -25,7 +25,7 @@ from slam.config import WheelNoise, load_preset
 from slam.live.session.description import settings_text
 from slam.live.session.reader import open_session
 from slam.live.session_records import Gap, LogLine, Scan, SessionObserver, Snapshot
-from slam.robust.parameters import BackEndParameters, MapRule, TrackletRule
+from slam.robust.parameters import BackEndParameters, InitialisationRule, MapRule
 from slam.robust.pipeline import RobustSlam
 from xethru_protocol.operating_system import StopFlag, StopRequestedError
 
@@ -205,7 +205,7 @@ def test_recorded_rules_are_taken_over_and_other_numbers_compared() -> None:
     rules = recorded_rules(recorded)
     assert rules.map == replace(MapRule(), refused_updates=7)
     assert rules.continuation.view_margin_rad == 1.5
-    assert rules.tracklets == BackEndParameters().tracklets
+    assert rules.initialisation == BackEndParameters().initialisation
     assert different_constants(recorded) == [
         "slam.front_end.matched_filter._REACH none, here 3.0",
         "slam.robust.branches._IDS_APART 9, here 1000",
@@ -224,12 +224,12 @@ def test_numbers_of_another_kind_are_not_taken_over() -> None:
 
 
 def test_a_replay_has_the_recorded_rules(tmp_path: Path) -> None:
-    constants = {"slam.robust.parameters.TrackletRule.window": 21}
+    constants = {"slam.robust.parameters.InitialisationRule.window": 21}
     info = replace(session_info(), **SETTINGS, constants=constants)
     session = write_session(tmp_path / "session.mcap", 3, odometry(9), info)
     slam = recorded_source(open_session(session), StopFlag()).slam
     assert isinstance(slam, RobustSlam)
-    assert slam.back_end.parameters.tracklets == TrackletRule(window=21)
+    assert slam.back_end.parameters.initialisation == InitialisationRule(window=21)
     assert slam.back_end.parameters.map == MapRule()
 
 
