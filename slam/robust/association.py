@@ -13,8 +13,7 @@ answers, along its normal n, from wherever the antenna q = p + R m is:
 Known landmarks come first, one to one. A landmark takes part if it may be in view and if the prior
 alone, without the noise of a range, predicts its ranges more surely than a range measures them;
 else what its ranges show is a new point at first, which may turn out to be the landmark. For each
-landmark one option is chosen, a range of some of the radars of
-the side, or of none, at the cost
+landmark one option is chosen, a range of some of the radars of the side, or of none, at the cost
 
     nu^T S^-1 nu + ln det(2 pi S) + 2 m ln(clutter density) - 2 m ln(Pd / (1 - Pd))
 

@@ -888,7 +888,8 @@ class RobustBackEnd:
             self._log.set_causal(self.state.pose)
             return True
         self._jumped = question.tentative.seen[0].pose
-        self._tentative.forget_before(self._jumped)
+        for waiting in (self._tentative, *self._crossings):
+            waiting.forget_before(self._jumped)
         self._walls.tentative.forget_before(self._jumped)
         self._settled = set()  # what was in view then was so from another pose
         sigmas = [parameters.jumps.sigma_m, parameters.jumps.sigma_m, parameters.jumps.sigma_rad]
@@ -962,15 +963,14 @@ class RobustBackEnd:
         pose, fewest = self._log.n_poses - 1, self.parameters.initialisation.min_frames
         for side, waiting in zip(self._sides, self._crossings, strict=True):
             radars = [radar for radar in side if radar not in self._images.radars]
-            for pair in combinations(radars, 2):
-                if not antennas.has_frame[list(pair)].all():
-                    continue
-                of_pair = [
-                    one
-                    for ranges in product(*map(self._unassigned.newest, pair))
-                    for one in crossing(self.state, antennas, ranges, self.parameters, pose)
-                ]
-                waiting.take([seen for seen, _ in of_pair], [point for _, point in of_pair])
+            pairs = [pair for pair in combinations(radars, 2) if antennas.has_frame[[*pair]].all()]
+            found = [
+                one
+                for pair in pairs
+                for ranges in product(*map(self._unassigned.newest, pair))
+                for one in crossing(self.state, antennas, ranges, self.parameters, pose)
+            ]
+            waiting.take([seen for seen, _ in found], [point for _, point in found])
             for tentative in waiting.unclear():
                 ranges = self._unassigned.fit(
                     tentative.point, radars, self.state, is_of_ranges=True

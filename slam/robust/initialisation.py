@@ -5,8 +5,8 @@ of a sensor that measures both, or, of radars without images, two ranges that cr
 place, too, and so has a ghost, the crossing of two ranges of different targets, which does not stay
 at rest while the robot moves. So a detection waits as a tentative landmark, which is followed along
 odometry by a Kalman filter on its two coordinates in the newest body frame, and becomes a landmark
-when enough scans hold it and they agree. Then it is fitted to the single ranges of the last frames
-that are of nothing known and near enough to it.
+when enough scans hold it and they agree. It is fitted to the single ranges of the last frames that
+are of nothing known and near enough to it; a crossing becomes a landmark only if they fit.
 
 The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in the
 antenna's position a; a point's is a hyperbola::
@@ -81,9 +81,9 @@ SEEN = -1
 # How often a point is fitted to the ranges nearest to it; what keeps matrices regular
 _FITS, _FLOOR = 3, 1e-12
 # A range that is of nothing known; every frame of a radar has a NaN, too. Antenna, its yaw and the
-# robot's heading are in the frame of odometry; ``way`` is what was driven until then, in metres and
-# radians. For the log there are the pose, the antenna in its body frame were the mount where the
-# rig has it, and the turn since then.
+# robot's heading then are in the frame of odometry; ``way`` is what was driven until then, in
+# metres and radians. For the log there are the pose, the antenna in its body frame were the mount
+# where the rig has it, and the turn since then.
 _UNASSIGNED = np.dtype(
     [
         ("frame", np.intp),
@@ -109,12 +109,15 @@ class FittedRanges:
     rows: NDArray[np.void]  # as `_UNASSIGNED` has them
     at: Indices  # where they are among the unassigned ones
     chi_square: float
-    chi_square_of_wall: float
+    chi_square_of_wall: float  # of the same ranges as those of a wall
 
     @property
     def is_flat(self) -> bool:
-        """Return whether the echo of a wall fits as well, which is a plane wave."""
-        return self.chi_square_of_wall <= self.chi_square
+        """Return whether they are no evidence of a point beside a wall, whose echo is a plane wave.
+
+        A curved one must fit better by what BIC asks for one parameter more.
+        """
+        return self.chi_square_of_wall <= self.chi_square + math.log(len(self.rows))
 
     @property
     def n_frames(self) -> int:
@@ -146,7 +149,10 @@ class _Looks:
         return self.ranges_m - distance - J[:, 2:] @ errors[2:], J, off
 
     def nearest(self, misses_m: Array) -> Indices:
-        """Return where the least miss is in each frame of each radar, (k,) [m], if it is finite."""
+        """Return where the least of all misses (k,) [m] in each frame of each radar is.
+
+        Where a frame has none that is finite, there is no place.
+        """
         order = np.argsort(misses_m, kind="stable")
         order = order[: np.count_nonzero(np.isfinite(misses_m))]
         first = np.unique(self.rows[["frame", "radar"]][order], return_index=True)[1]
@@ -222,7 +228,7 @@ class UnassignedRanges:
                 sigma_m,
                 places[scan.radar],
                 antennas.yaw_rad[scan.radar] + self._pose[2],
-                self._pose[2],
+                antennas.turns_rad[scan.radar] + self._pose[2],
                 self._way,
                 pose_index,
                 antennas.nominal_m[scan.radar],
@@ -288,7 +294,7 @@ class UnassignedRanges:
             return None
         chi_square = float(np.sum(np.square(residual[k]) / looks.variances[k]))
         chi_square += float(errors @ prior @ errors)
-        if not is_plausible(chi_square, len(k)):
+        if not is_plausible(chi_square, len(k) - 2 * is_of_ranges):
             return None
         # For the unknowns of the radars as they are in the state
         covariance = np.asarray(np.linalg.inv(information[:2, :2]))
@@ -316,7 +322,7 @@ class UnassignedRanges:
             yaws_rad=rows["yaw_rad"] - self._pose[2],
             headings_rad=rows["heading_rad"] - self._pose[2],
             ranges_m=rows["range_m"] - state.offsets_m[rows["radar"]],
-            variances=np.square(rows["sigma_m"]) + np.square(drifts).sum(axis=1),
+            variances=np.square(rows["sigma_m"]) + np.square(drifts).sum(axis=1) + _FLOOR,
             layout=state.layout,
         )
 
@@ -664,7 +670,7 @@ def crossing(
         by_radars = -J @ state.layout.ranges_by_radars(u, turns_rad, radars)
         # As if the unknowns of the radars were noise: a point that errs with them is not at rest.
         unknown = by_radars @ state.P.block(state.radar_columns) @ by_radars.T
-        covariance = (J * np.square([sigma_m, other_sigma_m])) @ J.T + unknown
+        covariance = (J * (np.square([sigma_m, other_sigma_m]) + _FLOOR)) @ J.T + unknown
         across = np.array([-u[0, 1], u[0, 0]])
         x_m, y_m = antennas.nominal_m[first].tolist()
         detection = PointDetection(
@@ -824,23 +830,22 @@ class TentativePoints:
             return {}
         odds = noise.detection_probability / (1.0 - noise.detection_probability)
         clutter = noise.clutter_per_m / noise.field_of_view_rad
-        limit = float(chdtri(2, TAIL_PROBABILITY))
+        before = [one.point for one in self._points]
+        S = np.add([[point.covariance] for point in points], [[one.covariance for one in before]])
+        nu = np.subtract([[point.point_m] for point in points], [[one.point_m for one in before]])
+        distance = np.einsum("kni,kni->kn", nu, np.linalg.solve(S, nu[..., None])[..., 0])
+        # Per square metre, clutter is the denser the nearer.
+        ranges_m = np.array([[detection.range_m] for detection in seen])
+        log_n = -0.5 * (distance + np.linalg.slogdet(math.tau * S)[1])
+        evidence = log_n + np.log(odds * ranges_m / clutter)
+        labels = [one.label for one in self._points]
+        is_named = np.array([[detection.label is not None] for detection in seen])
+        is_same = np.array([[detection.label == label for label in labels] for detection in seen])
+        is_same &= distance <= float(chdtri(2, TAIL_PROBABILITY))
+        # A label is better than to begin anew, which costs 0.
+        of_pairs = np.where(is_named, np.minimum(-evidence, -1.0), -evidence)
         cost = np.zeros((len(seen), n + len(seen)))
-        for k, (detection, point) in enumerate(zip(seen, points, strict=True)):
-            for at, one in enumerate(self._points):
-                S = one.point.covariance + point.covariance
-                nu = point.point_m - one.point.point_m
-                distance = float(nu @ np.linalg.solve(S, nu))
-                # Per square metre, clutter is the denser the nearer.
-                log_n = -0.5 * (distance + float(np.linalg.slogdet(math.tau * S)[1]))
-                evidence = log_n + math.log(odds * detection.range_m / clutter)
-                is_named = detection.label is not None
-                is_same = detection.label == one.label and distance <= limit
-                if is_same and (is_named or evidence > 0.0):
-                    # A label is better than to begin anew, which costs 0.
-                    cost[k, at] = min(-evidence, -1.0) if is_named else -evidence
-                else:
-                    cost[k, at] = _FORBIDDEN
+        cost[:, :n] = np.where(is_same & (is_named | (evidence > 0.0)), of_pairs, _FORBIDDEN)
         columns = linear_sum_assignment(cost)[1].tolist()
         return {k: at for k, at in enumerate(columns) if at < n}
 

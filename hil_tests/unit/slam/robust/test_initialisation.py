@@ -18,7 +18,7 @@ from hil_tests.unit.slam.robust.range_world import (
     true_path,
 )
 from slam.config import WheelNoise
-from slam.geometry import compose, paper_rig
+from slam.geometry import Rig, compose, paper_rig
 from slam.robust import kernels
 from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd
@@ -165,6 +165,59 @@ def test_what_a_straight_line_fits_as_well_is_a_wall() -> None:
     assert found.is_flat
 
 
+@pytest.mark.parametrize(("n_frames", "is_point"), [(20, True), (11, False)])
+def test_a_point_hits_most_frames_that_have_it_in_view(n_frames: int, is_point: bool) -> None:
+    """Of twenty frames; six in ten are asked for."""
+    unassigned, target = UnassignedRanges(PARAMETERS), np.array([0.0, 0.9])
+    for k in range(20):
+        ranges = [(range_after(0.0, radar, target),) if k < n_frames else () for radar in LEFT]
+        scans = [RangeScan(radar=radar, ranges_m=ranges[radar]) for radar in LEFT]
+        unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
+    assert (unassigned.fit(near(target), LEFT, state_of()) is not None) == is_point
+
+
+def test_unknown_places_of_antennas_move_the_point_as_they_do() -> None:
+    """By differences of points, from ranges that antennas elsewhere took while the robot turned."""
+    target, turn_rad, step_m = np.array([0.1, 0.8]), 0.3, 1e-5
+    nominal = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    turned = np.array([[c, -s], [s, c]])
+
+    def fitted(error_m: Array) -> BodyPoint:
+        """Return the point if the second antenna is mounted so far from its place."""
+        mounts = nominal.copy()
+        mounts[1] += error_m
+        unassigned = UnassignedRanges(replace(PARAMETERS, wheels=WheelNoise(scale_sigma=0.0)))
+        step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
+        for k in range(N_FRAMES):
+            if k:
+                unassigned.move(step)
+            scans = [
+                RangeScan(
+                    radar=radar,
+                    ranges_m=(
+                        float(np.hypot(*(target - turned @ mounts[radar] - [STEP_M * k, 0.0]))),
+                    ),
+                    moved=(0.0, 0.0, turn_rad),
+                )
+                for radar in LEFT
+            ]
+            unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
+        found = unassigned.fit(
+            near(target - WAY, 0.03, np.zeros((2, 12))),
+            LEFT,
+            state_of(1e-5, 1e-3),
+            is_of_ranges=True,
+        )
+        assert found is not None
+        return found.point
+
+    exact = fitted(np.zeros(2))
+    for axis, error_m in enumerate(step_m * np.eye(2)):
+        moved = (fitted(error_m).point_m - exact.point_m) / step_m
+        assert -moved == pytest.approx(exact.by_offsets[:, 6 + axis], rel=0.05, abs=0.01)
+
+
 TURNS_RAD = 0.05 * np.arange(12)
 """Of a robot that turns on the spot, frame by frame."""
 
@@ -279,12 +332,86 @@ def test_where_ranges_cross_scan_after_scan_there_is_a_landmark() -> None:
         back_end.update(scans)
         if k == RULE.min_frames - 2:
             assert not back_end.state.landmark_ids
+        if back_end.state.landmark_ids:
+            assert not any(waiting.unclear() for waiting in back_end._crossings)
+    assert back_end._unassigned.fit(near(target - WAY), LEFT, back_end.state) is None
     (landmark_id,) = back_end.state.landmark_ids
     assert back_end.state.landmarks_m[0] == pytest.approx(target, abs=1e-3)
     assert back_end.n_reported_since(landmark_id) == 1
+    assert len(back_end._log._ranges) == len(LEFT) * N_FRAMES  # each of them once
     poses = back_end.smoothed(np.arange(N_FRAMES - 1))
     assert poses is not None
     assert poses.landmarks_m[0] == pytest.approx(target, abs=1e-3)
+
+
+@pytest.mark.parametrize("step_m", [0.0, 0.02])
+def test_ranges_of_a_wall_make_no_landmark(step_m: float) -> None:
+    """From where it stands, and on its way, as its echo comes from where the wall is nearest."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        back_end = RobustBackEnd(paper_rig(), PARAMETERS)
+        for _ in range(40):
+            back_end.predict(np.array([step_m, 0.0, 0.0]))
+            depths_m = [0.9 - paper_rig().mounts[radar].y_m for radar in LEFT]
+            scans = [
+                RangeScan(radar=radar, ranges_m=(m + SIGMA_M * rng.standard_normal(),))
+                for radar, m in zip(LEFT, depths_m, strict=True)
+            ]
+            back_end.update(scans)
+        assert not back_end.state.landmark_ids
+
+
+def test_radars_that_get_images_begin_no_landmark_of_ranges_any_more() -> None:
+    target = np.array([0.0, 0.9])
+    for imaged in ((0, 1), (1,)):
+        back_end = RobustBackEnd(paper_rig(), PARAMETERS)
+        for k in range(2 * N_FRAMES):
+            back_end.predict(np.array([STEP_M if k else 0.0, 0.0, 0.0]))
+            late = k >= RULE.min_frames - 1
+            back_end.update(
+                [
+                    RangeScan(
+                        radar=radar,
+                        ranges_m=(range_after(0.0, radar, target - [STEP_M * k, 0.0]),),
+                        is_imaged=late and radar in imaged,
+                    )
+                    for radar in LEFT
+                ]
+            )
+        assert not back_end.state.landmark_ids
+
+
+def test_exact_ranges_without_a_standard_deviation_are_taken() -> None:
+    back_end, target = RobustBackEnd(paper_rig(), PARAMETERS), np.array([0.15, 0.9])
+    for k in range(N_FRAMES):
+        back_end.predict(np.array([STEP_M if k else 0.0, 0.0, 0.0]))
+        at = target - [STEP_M * k, 0.0]
+        back_end.update(
+            [
+                RangeScan(radar=radar, ranges_m=(range_after(0.0, radar, at),), sigmas_m=(0.0,))
+                for radar in LEFT
+            ]
+        )
+    assert back_end.state.landmarks_m[0] == pytest.approx(target, abs=1e-3)
+
+
+def test_of_three_radars_two_that_see_a_target_suffice() -> None:
+    one, two, *others = paper_rig().mounts
+    rig = Rig(mounts=(one, two, replace(one, name="middle", x_m=(one.x_m + two.x_m) / 2), *others))
+    target = np.array([0.0, 0.9])
+    for silent in range(3):
+        back_end = RobustBackEnd(rig, PARAMETERS)
+        for k in range(N_FRAMES):
+            back_end.predict(np.array([STEP_M if k else 0.0, 0.0, 0.0]))
+            places = [(mount.x_m + STEP_M * k, mount.y_m) for mount in rig.mounts[:3]]
+            ranges_m = [
+                () if radar == silent else (float(np.hypot(*(target - place))),)
+                for radar, place in enumerate(places)
+            ]
+            back_end.update(
+                [RangeScan(radar=radar, ranges_m=seen) for radar, seen in enumerate(ranges_m)]
+            )
+        assert len(back_end.state.landmark_ids) == 1
 
 
 def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> None:
