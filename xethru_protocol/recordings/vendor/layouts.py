@@ -178,13 +178,12 @@ def _list(text: str) -> tuple[float, ...]:
 
 
 class _Column(NamedTuple):
-    """A column of a text file: its title, the message's field, the field as text and back.
+    """A column of a text file: the message's field, the field as text and back.
 
     ``field`` is empty where the message has none; ``is_count``: the column counts the list
     ``field``.
     """
 
-    title: str
     field: str
     text: Callable[[Any], str]
     value: Callable[[str], Any]
@@ -196,14 +195,10 @@ class TextKind(_DataFileKind):
     """One kind of text file."""
 
     suffix: ClassVar[str] = ".csv"
-    columns: tuple[_Column, ...]
+    titles: bytes  # first line of a file, with its end of line
+    columns: tuple[_Column, ...]  # behind that of the time
     absent: Mapping[str, Any]  # fields that the file has no column for, as they are read back
     is_free_text: bool  # the last column may hold separators and line ends
-
-    @property
-    def titles(self) -> bytes:
-        """First line of a file, with its end of line."""
-        return (";".join(("TimeStamp", *(column.title for column in self.columns))) + "\n").encode()
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
@@ -225,7 +220,7 @@ class TextKind(_DataFileKind):
             raise ValueError(f"{n_columns} columns were expected, not {len(cells) + 1}")
         values: dict[str, Any] = dict(self.absent)
         counts: dict[str, int] = {}
-        for (_, name, _, value_of, is_count), cell in zip(self.columns, cells, strict=True):
+        for (name, _, value_of, is_count), cell in zip(self.columns, cells, strict=True):
             if name:
                 (counts if is_count else values)[name] = value_of(cell)
         for name, count in counts.items():
@@ -236,33 +231,31 @@ class TextKind(_DataFileKind):
         return message, _time_ns(stamp)
 
 
-def _text(
-    name: str, bit: int, message: type[Response], titles: dict[str, str], **absent: int
-) -> TextKind:
-    """Return the kind whose columns have these titles and hold these fields, in their order.
+def _text(name: str, bit: int, message: type[Response], titles: str, **absent: int) -> TextKind:
+    """Return the kind with these titles, behind that of the time.
 
-    A column without a field is written as 0. ``absent`` are the fields without a column.
+    Its columns are the message's fields in their order, but for those that are ``absent``; one
+    behind them has no field and is written as 0.
     """
-    kinds = dict(ROWS[message].kinds)
-    columns = []
-    is_free_text = False
-    for title, field_name in titles.items():
-        match kinds[field_name] if field_name else None:
-            case None:
-                column = _Column(title, "", lambda _: "0", str)
-            case fields.Number(code="f"):
-                column = _Column(title, field_name, float_text, _float32)
-            case fields.Floats():
-                column = _Column(title, field_name, _list_text, _list)
-            case fields.Elements():
-                is_free_text = True
-                column = _Column(title, field_name, str, str)
-            case fields.Count(of=(counted, *_)):
-                column = _Column(title, counted, lambda of: str(len(of)), int, is_count=True)
-            case _:
-                column = _Column(title, field_name, str, int)
-        columns.append(column)
-    return TextKind(name, 1 << bit, message, tuple(columns), absent, is_free_text)
+    kinds = [(field, kind) for field, kind in ROWS[message].kinds if field not in absent]
+    columns = [_column(field, kind) for field, kind in kinds]
+    columns += [_Column("", lambda _: "0", str)] * (titles.count(";") + 1 - len(columns))
+    is_free_text = any(isinstance(kind, fields.Elements) for _, kind in kinds)
+    line = f"TimeStamp;{titles}\n".encode()
+    return TextKind(name, 1 << bit, message, line, tuple(columns), absent, is_free_text)
+
+
+def _column(name: str, kind: fields.FieldKind) -> _Column:
+    match kind:
+        case fields.Number(code="f"):
+            return _Column(name, float_text, _float32)
+        case fields.Floats():
+            return _Column(name, _list_text, _list)
+        case fields.Elements():
+            return _Column(name, str, str)
+        case fields.Count(of=(counted, *_)):
+            return _Column(counted, lambda of: str(len(of)), int, is_count=True)
+    return _Column(name, str, int)
 
 
 _UNIX = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
@@ -287,123 +280,66 @@ TEXT_KINDS = (
         "presence_single",
         12,
         messages.PresenceSingle,
-        {
-            "Counter": "counter",
-            "PresenceState": "state",
-            "Distance": "distance_m",
-            "Direction": "direction",
-            "SignalQuality": "signal_quality",
-        },
+        "Counter;PresenceState;Distance;Direction;SignalQuality",
     ),
     _text(
         "presence_movinglist",
         13,
         messages.PresenceMovingList,
-        {
-            "Counter": "counter",
-            "PresenceState": "state",
-            "MovementIntervalCount": "interval_count",
-            "DetectionCount": "detection_count",
-            "MovementSlowItem": "movement_slow",
-            "MovementFastItem": "movement_fast",
-            "DetectionDistance": "detection_distance_m",
-            "DetectionRadarCrossSection": "detection_rcs",
-            "DetectionVelocity": "detection_velocity",
-        },
+        "Counter;PresenceState;MovementIntervalCount;DetectionCount;MovementSlowItem;"
+        "MovementFastItem;DetectionDistance;DetectionRadarCrossSection;DetectionVelocity",
     ),
     _text(
         "sleep",
         2,
         messages.SleepStatus,
-        {
-            "FrameCounter": "counter",
-            "State": "state",
-            "RPM": "rpm",
-            "ObjectDistance": "distance_m",
-            "SignalQuality": "signal_quality",
-            "MovementSlow": "movement_slow",
-            "MovementFast": "movement_fast",
-        },
+        "FrameCounter;State;RPM;ObjectDistance;SignalQuality;MovementSlow;MovementFast",
     ),
     _text(
         "respiration",
         3,
         messages.RespStatus,
-        {
-            "State": "state",
-            "RPM": "rpm",
-            "ObjectDistance": "distance_m",
-            "ObjectMovement": "movement_mm",
-            "SignalQuality": "signal_quality",
-        },
+        "State;RPM;ObjectDistance;ObjectMovement;SignalQuality",
         counter=0,
     ),
     _text(
         "datastring",
         5,
         messages.DataString,
-        {"ContentId": "content_id", "Info": "info", "Message": "text"},
+        "ContentId;Info;Message",
     ),
     _text(
         "respiration_detectionlist",
         14,
         messages.RespirationDetectionList,
-        {
-            "Counter": "counter",
-            "DetectionCount": "detection_count",
-            "DetectionDistanceItems": "detection_distance_m",
-            "DetectionRadarCrossSectionItems": "detection_rcs",
-            "DetectionVelocityItems": "detection_velocity",
-        },
+        "Counter;DetectionCount;DetectionDistanceItems;DetectionRadarCrossSectionItems;"
+        "DetectionVelocityItems",
     ),
     _text(
         "respiration_movinglist",
         15,
         messages.RespirationMovingList,
-        {
-            "Counter": "counter",
-            "MovementIntervalCount": "interval_count",
-            "MovementSlowItems": "movement_slow",
-            "MovementFastItems": "movement_fast",
-        },
+        "Counter;MovementIntervalCount;MovementSlowItems;MovementFastItems",
     ),
     _text(
         "vitalsigns",
         16,
         messages.VitalSigns,
-        {
-            "FrameCounter": "counter",
-            "State": "state",
-            "RPM": "respiration_rate",
-            "Distance": "respiration_distance_m",
-            "RespirationConfidence": "respiration_confidence",
-            "HeartBPM": "heart_rate",
-            "HeartDistance": "heart_distance_m",
-            "HeartConfidence": "heart_confidence",
-            "NormalizedMovementSlow": "normalized_movement_slow",
-            "NormalizedMovementFast": "normalized_movement_fast",
-            "NormalizedMovementStart": "normalized_movement_start_m",
-            "NormalizedMovementEnd": "normalized_movement_end_m",
-        },
+        "FrameCounter;State;RPM;Distance;RespirationConfidence;HeartBPM;HeartDistance;"
+        "HeartConfidence;NormalizedMovementSlow;NormalizedMovementFast;NormalizedMovementStart;"
+        "NormalizedMovementEnd",
     ),
     _text(
         "sleepstage",
         17,
         messages.SleepStage,
-        {"FrameCounter": "counter", "SleepStage": "stage", "Confidence": ""},
+        "FrameCounter;SleepStage;Confidence",
     ),
     _text(
         "respiration_normalizedmovementlist",
         18,
         messages.RespirationNormalizedMovementList,
-        {
-            "Counter": "counter",
-            "Start": "start_m",
-            "BinLength": "bin_length_m",
-            "Count": "count",
-            "NormalizedMovementSlowItems": "movement_slow",
-            "NormalizedMovementFastItems": "movement_fast",
-        },
+        "Counter;Start;BinLength;Count;NormalizedMovementSlowItems;NormalizedMovementFastItems",
     ),
 )
 
