@@ -10,6 +10,7 @@ pulse's bandwidth and neighbours are alike, in the first half of the values (I) 
 not decide.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,9 +18,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.driver.frames import FrameGeometry, complex_of
 from xethru_protocol.wire.codes import X4Setting
-from xethru_protocol.wire.messages import DataFloat, ReplyFloat, ReplyInt, X4Value
+from xethru_protocol.wire.messages import (
+    REGISTERS,
+    BasebandAp,
+    BasebandIq,
+    DataFloat,
+    RadarBasebandFloat,
+    RadarBasebandQ15,
+    RadarMessage,
+    RadarRf,
+    RadarRfNormalized,
+    ReplyByte,
+    ReplyFloat,
+    ReplyInt,
+)
 from xethru_protocol.wire.table import Response
 
 _MOST_BASEBAND_BINS = 188  # Protocol reference 9.4
@@ -106,46 +120,79 @@ class FrameLayouts:
         return FrameLayout(values=length, downconversion=roughness < _SMOOTH, inferred=True)
 
 
-class FrameGeometries:
-    """Gathers the module's answers about its frame area, which say where a frame's bins lie.
+FrameMessage = DataFloat | BasebandIq | BasebandAp | RadarMessage
+"""A message that holds a frame, DATA FLOAT if its content is 0."""
+_SETTINGS = frozenset(X4Setting) - REGISTERS
+_PLACES = (X4Setting.FRAMEAREA.name, X4Setting.FRAMEBINCOUNT.name)
 
-    ``answers`` has them by the names of `X4Setting`: FRAMEAREA (start, end) in module metres and
-    FRAMEBINCOUNT.
+
+class FrameGeometries:
+    """Gathers the module's answers about its settings, which say where a frame's bins lie.
+
+    ``answers`` has them by the names of `X4Setting`; FRAMEAREA is (start, end) in module metres.
     """
 
     def __init__(self) -> None:
-        self.answers: dict[str, X4Value] = {}
+        self.answers: dict[str, Any] = {}
 
     def take(self, message: Response) -> None:
         match message:
-            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
-                self.answers[X4Setting.FRAMEAREA.name] = start_m, end_m
-            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
-                self.answers[X4Setting.FRAMEBINCOUNT.name] = n_bins
+            case ReplyByte() | ReplyInt() | ReplyFloat():
+                if message.content_id in _SETTINGS and message.values:
+                    values = tuple(message.values)
+                    name = X4Setting(message.content_id).name
+                    self.answers[name] = values[0] if len(values) == 1 else values
 
-    def about(self, frame: DataFloat) -> dict[str, Any]:
+    def about(self, frame: FrameMessage) -> dict[str, Any]:
         """Return what is known of a frame, by the names in the info of an MCAP file."""
         geometry = self.of(frame)
         return {
             "range_start_m": None if geometry is None else geometry.range_start_m,
             "bin_length_m": None if geometry is None else geometry.bin_length_m,
             "n_bins": None if geometry is None else geometry.n_bins,
-            "settings": dict(self.answers),
+            "settings": {name: self.answers[name] for name in _PLACES if name in self.answers},
         }
 
-    def of(self, frame: DataFloat) -> FrameGeometry | None:
-        """Return where the bins of a frame lie; None if the answers are missing or of others."""
-        area_m = self.answers.get(X4Setting.FRAMEAREA.name)
-        n_bins = self.answers.get(X4Setting.FRAMEBINCOUNT.name)
-        if not isinstance(area_m, tuple) or not isinstance(n_bins, int):
-            return None
-        if len(frame.values) not in {n_bins, 2 * n_bins}:
-            return None  # of another time
-        return FrameGeometry.from_read_back(
-            area_m=(float(area_m[0]), float(area_m[1])),
-            n_bins=n_bins,
-            downconversion=len(frame.values) == 2 * n_bins,
-        )
+    def of(self, frame: FrameMessage) -> FrameGeometry | None:
+        """Return where the bins of a frame lie, by the message or the answers; None if unknown."""
+        geometry: FrameGeometry | None
+        if isinstance(frame, DataFloat):
+            geometry = self._answered(len(frame.values))
+        else:
+            geometry = FrameGeometry(
+                range_start_m=frame.range_offset_m,
+                bin_length_m=frame.bin_length_m,
+                n_bins=frame.num_bins,
+                downconversion=not isinstance(frame, RadarRf | RadarRfNormalized),
+            )
+        is_known = geometry is not None and all(map(math.isfinite, geometry.area_m))
+        return geometry if is_known else None
+
+    def _answered(self, n_values: int) -> FrameGeometry | None:
+        match tuple(map(self.answers.get, _PLACES)):
+            case (start_m, end_m), int(n_bins) if n_values in {n_bins, 2 * n_bins}:
+                return FrameGeometry.from_read_back(
+                    area_m=(float(start_m), float(end_m)),
+                    n_bins=n_bins,
+                    downconversion=n_values == 2 * n_bins,
+                )
+        return None  # they are missing, or of another time
+
+
+def samples_of(frame: FrameMessage) -> npt.NDArray[Any]:
+    """Return RF or complex baseband, shape (n_bins,); of DATA FLOAT the values as sent."""
+    match frame:
+        case DataFloat():
+            return frame.values
+        case BasebandAp(amplitude=amplitude, phase=phase):
+            return complex_of(amplitude * np.cos(phase), amplitude * np.sin(phase))
+        case BasebandIq(i=i, q=q):
+            return complex_of(i, q)
+        case RadarBasebandFloat() | RadarBasebandQ15():
+            return frame.iq
+        case RadarRf() | RadarRfNormalized():
+            return frame.samples.astype(np.float32)
+    raise AssertionError(f"no frame: {frame}")
 
 
 def _is_rf(length: int) -> bool:

@@ -13,8 +13,8 @@ Nothing is read before the first question. Then a file is read once for what des
 
 import math
 from array import array
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import ChainMap, Counter
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -40,7 +40,12 @@ from xethru_protocol.recordings.formats import (
     recording_content,
     refuse_name,
 )
-from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayout, FrameLayouts
+from xethru_protocol.recordings.frame_layout import (
+    FrameGeometries,
+    FrameLayout,
+    FrameLayouts,
+    samples_of,
+)
 from xethru_protocol.recordings.recorded_messages import (
     MODULE_METRES,
     NO_TIME_NS,
@@ -51,20 +56,7 @@ from xethru_protocol.recordings.recorded_messages import (
 )
 from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import X4Setting
-from xethru_protocol.wire.messages import (
-    REGISTERS,
-    BasebandAp,
-    BasebandIq,
-    DataFloat,
-    RadarBasebandFloat,
-    RadarBasebandQ15,
-    RadarMessage,
-    RadarRf,
-    RadarRfNormalized,
-    ReplyByte,
-    ReplyFloat,
-    ReplyInt,
-)
+from xethru_protocol.wire.messages import BasebandAp, BasebandIq, DataFloat, RadarMessage
 from xethru_protocol.wire.x4 import TRUE_PER_MODULE_METRE, real_frame_rate
 
 _BLOCK = 1024
@@ -390,7 +382,7 @@ class _Messages:
         self._radar = radar
         self._area_m, self._downconversion = area_m, downconversion
         self._info = info if info.get("length_unit") == MODULE_METRES else {}
-        self._settings: dict[str, Any] = {}
+        self._settings: MutableMapping[str, Any] = {}
 
     def find(self, on_fault: FaultHandler) -> list[Frames]:
         """Read the recording once for what describes its frames."""
@@ -457,48 +449,32 @@ class _Messages:
         self, on_fault: FaultHandler, layouts: FrameLayouts | None = None
     ) -> Iterator[_FrameRow]:
         geometries = FrameGeometries()
-        self._settings = _settings_of(self._info)
+        self._settings = ChainMap(geometries.answers, _settings_of(self._info))
         for message, t_ns in read_recording(self._path, on_fault, radar=self._radar):
             if layouts is not None:
                 layouts.take(message)
+            geometries.take(message)
             match message:
-                case DataFloat(content_id=0):
-                    yield self._raw(message, geometries.of(message), t_ns)
+                case DataFloat(content_id=0, info=counter, values=values):
+                    n_values = len(values)
                 case BasebandIq() | BasebandAp() | RadarMessage():
-                    layout = _ArrayLayout(
-                        message_name(message),
-                        message.num_bins,
-                        _length_m(message.range_offset_m),
-                        _length_m(message.bin_length_m),
-                        None,
-                    )
-                    if isinstance(message, RadarMessage):
-                        self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
-                    yield _FrameRow(layout, message.counter, _samples(message), t_ns)
-                case ReplyByte() | ReplyInt() | ReplyFloat():
-                    geometries.take(message)
-                    self._take_setting(message)
+                    counter, n_values = message.counter, message.num_bins
+                case _:
+                    continue
+            if isinstance(message, RadarMessage):
+                self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
+            layout = self._layout(message_name(message), n_values, geometries.of(message))
+            yield _FrameRow(layout, counter, samples_of(message), t_ns)
 
-    def _raw(
-        self, message: DataFloat, geometry: FrameGeometry | None, t_ns: int | None
-    ) -> _FrameRow:
-        n_values = len(message.values)
-        layout = _ArrayLayout(_RAW, n_values, None, None, None)
+    def _layout(self, name: str, n_values: int, geometry: FrameGeometry | None) -> _ArrayLayout:
         if geometry is not None:
-            start_m, bin_m = geometry.range_start_m, geometry.bin_length_m
-            layout = _ArrayLayout(_RAW, n_values, start_m, bin_m, geometry.downconversion)
-        elif (n_bins := self._info.get("n_bins")) in (n_values, n_values / 2):
-            lengths_m = [
-                _length_m(self._info.get(key)) for key in ("range_start_m", "bin_length_m")
-            ]
-            layout = _ArrayLayout(_RAW, n_values, lengths_m[0], lengths_m[1], n_bins != n_values)
-        return _FrameRow(layout, message.info, message.values, t_ns)
-
-    def _take_setting(self, message: ReplyByte | ReplyInt | ReplyFloat) -> None:
-        if message.content_id in _SETTINGS and message.values:
-            values = tuple(message.values)
-            name = X4Setting(message.content_id).name
-            self._settings[name] = values[0] if len(values) == 1 else values
+            place_m = geometry.range_start_m, geometry.bin_length_m
+            return _ArrayLayout(name, n_values, *place_m, geometry.downconversion)
+        n_bins = self._info.get("n_bins")
+        if name != _RAW or n_bins not in (n_values, n_values / 2):
+            return _ArrayLayout(name, n_values, None, None, None)
+        start_m, bin_m = map(_length_m, map(self._info.get, ("range_start_m", "bin_length_m")))
+        return _ArrayLayout(name, n_values, start_m, bin_m, n_bins != n_values)
 
 
 def _length_m(value: object) -> float | None:
@@ -507,7 +483,6 @@ def _length_m(value: object) -> float | None:
 
 
 _RAW = "DATA FLOAT"
-_SETTINGS = frozenset(X4Setting) - REGISTERS
 
 
 def _settings_of(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -530,19 +505,6 @@ def _settings_of(info: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(rate_hz, int | float) and rate_hz > 0:
         settings[X4Setting.FPS.name] = float(rate_hz)
     return settings
-
-
-def _samples(message: BasebandIq | BasebandAp | RadarMessage) -> Samples:
-    match message:
-        case BasebandAp(amplitude=amplitude, phase=phase):
-            return complex_of(amplitude * np.cos(phase), amplitude * np.sin(phase))
-        case BasebandIq(i=i, q=q) | RadarBasebandFloat(i=i, q=q):
-            return complex_of(i, q)
-        case RadarBasebandQ15():
-            return message.iq
-        case RadarRf() | RadarRfNormalized():
-            return message.samples.astype(np.float32)
-    raise AssertionError(f"no frame: {message_name(message)}")
 
 
 class Recording(RadarArrays):

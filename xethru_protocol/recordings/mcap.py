@@ -40,7 +40,6 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.operating_system import written_whole
 from xethru_protocol.recordings.frame_layout import FrameGeometries
 from xethru_protocol.recordings.recorded_messages import (
@@ -785,7 +784,6 @@ class RadarTopics:
         if self._has_info:
             return
         self._has_info = True
-        geometry = self._geometry(frame)
         info: dict[str, object] = {
             "name": self._name,
             "serial": "",
@@ -794,26 +792,12 @@ class RadarTopics:
             "y_m": None,
             "yaw_rad": None,
             "range_offset_m": None,
-            "range_start_m": None if geometry is None else geometry.range_start_m,
-            "bin_length_m": None if geometry is None else geometry.bin_length_m,
-            "n_bins": None if geometry is None else geometry.n_bins,
             "rate_hz": None,
-            "settings": self._geometries.answers,
             "length_unit": MODULE_METRES,
+            **self._geometries.about(frame),
             **self._about,
         }
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
-
-    def _geometry(self, frame: DataFloat | BasebandIq | BasebandAp) -> FrameGeometry | None:
-        """Where the bins lie, from the message or from earlier answers of the module."""
-        if not isinstance(frame, DataFloat):
-            return FrameGeometry(
-                range_start_m=frame.range_offset_m,
-                bin_length_m=frame.bin_length_m,
-                n_bins=frame.num_bins,
-                downconversion=True,
-            )
-        return self._geometries.of(frame)
 
     def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
         key = topic, t_ns is not None

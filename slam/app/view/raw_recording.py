@@ -21,7 +21,7 @@ from xethru_protocol.driver.frames import complex_of
 from xethru_protocol.operating_system import one_line
 from xethru_protocol.recordings import RecordingFault, read_recording
 from xethru_protocol.recordings.formats import message_name, recording_facts, recording_format
-from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayouts
+from xethru_protocol.recordings.frame_layout import FrameGeometries, FrameLayouts, samples_of
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.table import Response
 from xethru_protocol.wire.x4 import BASEBAND_BIN_M, RF_BIN_M
@@ -190,7 +190,7 @@ class _Drawing:
                 self._add(message, samples, geometry.downconversion, place, t_ns)
             case m.BasebandIq() | m.BasebandAp() | m.RadarMessage():
                 self._counter = message.counter
-                samples = _samples_of(message)
+                samples = samples_of(message)
                 place = (message.range_offset_m, message.bin_length_m)
                 self._add(message, samples, np.iscomplexobj(samples), place, t_ns)
             case _:
@@ -300,19 +300,6 @@ class _Drawing:
             columns = rr.TextLog.columns(text=list(texts), level=list(levels))
             self._recording.rows(f"{self._prefix}log", self._line_stamps, columns)
         self._lines, self._line_stamps = [], RowTimes()
-
-
-def _samples_of(message: m.BasebandIq | m.BasebandAp | m.RadarMessage) -> Samples:
-    match message:
-        case m.BasebandAp():
-            return np.asarray(message.amplitude * np.exp(1j * message.phase), dtype=np.complex64)
-        case m.BasebandIq():
-            return complex_of(message.i, message.q)
-        case m.RadarBasebandFloat() | m.RadarBasebandQ15():
-            return message.iq
-        case m.RadarRf() | m.RadarRfNormalized():
-            return message.samples.astype(np.float32)
-    raise AssertionError(message)
 
 
 def _brightest(picture: NDArray[np.float32]) -> float:
