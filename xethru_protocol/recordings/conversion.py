@@ -90,7 +90,7 @@ def convert(
         raise RecordingError(f"{target} exists already")
     if suffix in SUFFIXES:
         loaded = load(source, faults.append, area_m=area_m, downconversion=downconversion)
-        frames = (loaded.radar if radar is None else loaded.named(radar)).frames
+        frames = loaded.named(radar).frames
         write_array_file(target, frames)
         if on_progress is not None:
             on_progress(frames.n_frames)

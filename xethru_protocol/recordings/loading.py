@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequenc
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,7 @@ from xethru_protocol.recordings.frame_layout import (
     FrameGeometries,
     FrameLayout,
     FrameLayouts,
+    FrameMessage,
     samples_of,
 )
 from xethru_protocol.recordings.recorded_messages import (
@@ -338,20 +339,11 @@ def _ranges_in(
 
 
 class _ArrayLayout(NamedTuple):
-    """What frames with a common array have in common; lengths in module metres."""
+    """What frames with a common array have in common."""
 
     message: str
     n_values: int
-    start_m: float | None
-    bin_m: float | None
-    downconversion: bool | None  # of DATA FLOAT, by the module's answers
-
-
-class _FrameRow(NamedTuple):
-    layout: _ArrayLayout
-    counter: int
-    values: npt.NDArray[Any]  # of DATA FLOAT as sent, else in the dtype of its kind
-    t_ns: int | None
+    geometry: FrameGeometry | None
 
 
 @dataclass(slots=True)
@@ -388,13 +380,13 @@ class _Messages:
         """Read the recording once for what describes its frames."""
         columns: dict[_ArrayLayout, _FrameColumns] = {}
         layouts = FrameLayouts(self._downconversion)
-        for row in self._rows(on_fault, layouts):
-            column = columns.get(row.layout)
+        for layout, frame, t_ns in self._rows(on_fault, layouts):
+            column = columns.get(layout)
             if column is None:
-                column = columns[row.layout] = _FrameColumns(dict(self._settings))
+                column = columns[layout] = _FrameColumns(dict(self._settings))
             column.fps.add(self._settings.get(X4Setting.FPS.name, 0.0))
-            column.counter.append(row.counter)
-            column.t_ns.append(NO_TIME_NS if row.t_ns is None else row.t_ns)
+            column.counter.append(frame.info if isinstance(frame, DataFloat) else frame.counter)
+            column.t_ns.append(NO_TIME_NS if t_ns is None else t_ns)
         found = layouts.layouts()
         return [self._frames(layout, column, found) for layout, column in columns.items()]
 
@@ -402,18 +394,16 @@ class _Messages:
         self, layout: _ArrayLayout, column: _FrameColumns, found: Mapping[int, FrameLayout]
     ) -> Frames:
         kind: FrameKind | None = "rf" if layout.message.startswith("RADAR_RF") else "iq"
-        n_bins = layout.n_values
-        inferred = False
+        n_bins, geometry, inferred = layout.n_values, layout.geometry, False
         if layout.message == _RAW:
-            downconversion = found[n_bins].downconversion
-            inferred = found[n_bins].inferred and layout.downconversion is None
-            if self._downconversion is None and layout.downconversion is not None:
-                downconversion = layout.downconversion
-            kind = None if downconversion is None else "iq" if downconversion else "rf"
-            n_bins = n_bins // 2 if downconversion else n_bins
+            raw = found[n_bins]
+            if self._downconversion is None and geometry is not None:
+                raw = FrameLayout(values=n_bins, downconversion=geometry.downconversion)
+            kind = None if raw.downconversion is None else "iq" if raw.downconversion else "rf"
+            n_bins, inferred = raw.bins or n_bins, raw.inferred
         ranges_m = _ranges_in(self._area_m, n_bins, kind)
-        if ranges_m is None and layout.start_m is not None and layout.bin_m is not None:
-            ranges_m = layout.start_m + np.arange(n_bins, dtype=np.float64) * layout.bin_m
+        if ranges_m is None and geometry is not None:
+            ranges_m = replace(geometry, n_bins=n_bins).ranges_m
         t_ns = np.array(column.t_ns, np.int64)
         # the first frames come before the answer that gives their rate
         running = {value for value in column.fps if real_frame_rate(value)}
@@ -438,16 +428,16 @@ class _Messages:
         )
 
     def _chunks(self, layout: _ArrayLayout, kind: FrameKind | None) -> Iterator[Samples]:
-        for row in self._rows(lambda fault: None):
-            if row.layout == layout:
-                values = row.values
+        for found, frame, _ in self._rows(lambda fault: None):
+            if found == layout:
+                values = samples_of(frame)
                 if kind == "iq" and values.dtype != np.complex64:
                     values = complex_of(*np.split(values, 2))
                 yield values[np.newaxis]
 
     def _rows(
         self, on_fault: FaultHandler, layouts: FrameLayouts | None = None
-    ) -> Iterator[_FrameRow]:
+    ) -> Iterator[tuple[_ArrayLayout, FrameMessage, int | None]]:
         geometries = FrameGeometries()
         self._settings = ChainMap(geometries.answers, _settings_of(self._info))
         for message, t_ns in read_recording(self._path, on_fault, radar=self._radar):
@@ -455,31 +445,34 @@ class _Messages:
                 layouts.take(message)
             geometries.take(message)
             match message:
-                case DataFloat(content_id=0, info=counter, values=values):
+                case DataFloat(content_id=0, values=values):
                     n_values = len(values)
+                    geometry = geometries.of(message) or self._described(n_values)
                 case BasebandIq() | BasebandAp() | RadarMessage():
-                    counter, n_values = message.counter, message.num_bins
+                    n_values, geometry = message.num_bins, geometries.of(message)
+                    if isinstance(message, RadarMessage):
+                        self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
                 case _:
                     continue
-            if isinstance(message, RadarMessage):
-                self._settings[X4Setting.FPS.name] = float(message.frames_per_s)
-            layout = self._layout(message_name(message), n_values, geometries.of(message))
-            yield _FrameRow(layout, counter, samples_of(message), t_ns)
+            yield _ArrayLayout(message_name(message), n_values, geometry), message, t_ns
 
-    def _layout(self, name: str, n_values: int, geometry: FrameGeometry | None) -> _ArrayLayout:
-        if geometry is not None:
-            place_m = geometry.range_start_m, geometry.bin_length_m
-            return _ArrayLayout(name, n_values, *place_m, geometry.downconversion)
-        n_bins = self._info.get("n_bins")
-        if name != _RAW or n_bins not in (n_values, n_values / 2):
-            return _ArrayLayout(name, n_values, None, None, None)
-        start_m, bin_m = map(_length_m, map(self._info.get, ("range_start_m", "bin_length_m")))
-        return _ArrayLayout(name, n_values, start_m, bin_m, n_bins != n_values)
+    def _described(self, n_values: int) -> FrameGeometry | None:
+        """Return where the bins of raw frames lie by the description of the radar."""
+        n_bins, start_m, bin_m = map(self._info.get, ("n_bins", "range_start_m", "bin_length_m"))
+        if n_bins not in (n_values, n_values / 2) or not (
+            _is_length(start_m) and _is_length(bin_m)
+        ):
+            return None
+        return FrameGeometry(
+            range_start_m=float(start_m),
+            bin_length_m=float(bin_m),
+            n_bins=n_bins,
+            downconversion=n_bins != n_values,
+        )
 
 
-def _length_m(value: object) -> float | None:
-    """Return a length of a description; None for anything else."""
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+def _is_length(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 _RAW = "DATA FLOAT"
@@ -537,24 +530,22 @@ class Recording(RadarArrays):
     @property
     def radar(self) -> RadarArrays:
         """The only radar; RecordingError if there are several."""
-        if not self.radars:
-            raise RecordingError(f"{self.path} holds no radar frames")
-        if len(self.radars) != 1:
-            names = ", ".join(map(shown, self.radars))
-            raise RecordingError(
-                f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
-                "choose one: --radar NAME, in Python .radars[NAME]"
-            )
-        (radar,) = self.radars.values()
-        return radar
+        return self.named(None)
 
-    def named(self, name: str) -> RadarArrays:
-        """Return a radar by name; RecordingError if there is none of that name."""
+    def named(self, name: str | None) -> RadarArrays:
+        """Return a radar by name, the only one for None; RecordingError if there is none such."""
         if not self.radars:
             raise RecordingError(f"{self.path} holds no radar frames")
+        names = ", ".join(map(shown, self.radars))
+        if name is None:
+            if len(self.radars) != 1:
+                raise RecordingError(
+                    f"{self.path} holds {len(self.radars)} radars, not one: {names}; "
+                    "choose one: --radar NAME, in Python .radars[NAME]"
+                )
+            (name,) = self.radars
         if name not in self.radars:
             refuse_name(self.path, None if any(self.radars) else name)
-            names = ", ".join(map(shown, self.radars))
             raise RecordingError(f"{self.path} holds no radar {shown(name)}; it holds {names}")
         return self.radars[name]
 

@@ -161,7 +161,7 @@ def _recorded(arguments: Namespace) -> FrameSource:
             f"{path} holds several radars: {names}; choose one with --radar NAME, or see all of a "
             "session with 'uwb-slam view'"
         )
-    radar = recording.radar if arguments.radar is None else recording.named(arguments.radar)
+    radar = recording.named(arguments.radar)
     if not radar.parts:
         raise CommandFailed(f"{path} holds no radar frames")
     frames = max(radar.parts, key=lambda part: part.n_frames)
