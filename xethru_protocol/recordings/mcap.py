@@ -38,6 +38,7 @@ from mcap import records as records  # repair reads them, too
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
+from mcap.records import Metadata as Metadata  # an `Entry`, for its readers
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.operating_system import written_whole
@@ -457,14 +458,6 @@ def _records_in(at: int, content: bytes) -> Iterator[LocatedRecord]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Metadata:
-    """A named table of the file."""
-
-    name: str
-    values: dict[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
     """A topic; `message_type` is the name of its schema."""
 
@@ -553,8 +546,8 @@ def _entry(
             channel = Channel(topic=topic, message_type=schemas.get(schema, ""), metadata=table)
             channels[number] = channel
             return channel
-        case records.Metadata(name=name, metadata=table):
-            return Metadata(name=name, values=table)
+        case Metadata() as table:
+            return table
     return None
 
 
@@ -597,7 +590,7 @@ class McapWriter(Writer):
         )
         self.has_copies = False
         self._schema_ids: dict[str, int] = {}
-        self._latched: dict[int, _Latched | None] = {}
+        self._latched: dict[int, tuple[int, bytes, int] | None] = {}  # time, data, published
         self._n_messages = 0  # of channels that are not latched
         self._n_chunks = 0
         self.start(profile=profile, library=library)
@@ -626,7 +619,7 @@ class McapWriter(Writer):
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         if channel_id in self._latched:
-            self._latched[channel_id] = _Latched(log_time, publish_time, data)
+            self._latched[channel_id] = log_time, data, publish_time
         else:
             self._n_messages += 1
         super().add_message(channel_id, log_time, data, publish_time, sequence)
@@ -651,7 +644,7 @@ class McapWriter(Writer):
         sequence = self._n_messages & 0xFFFFFFFF
         for number, last in self._latched.items():
             if last is not None:
-                super().add_message(number, last.t_ns, last.data, last.publish_ns, sequence)
+                super().add_message(number, *last, sequence)
         self.flush()  # type: ignore[no-untyped-call]  # mcap annotates in part
         self._pack_index()
 
@@ -680,13 +673,6 @@ class _PackedIndex:
 
     def write(self, stream: RecordBuilder) -> None:
         stream.write(self._record)
-
-
-@dataclass(frozen=True, slots=True)
-class _Latched:
-    t_ns: int
-    publish_ns: int
-    data: bytes
 
 
 def index_of(stream: BinaryIO, size: int) -> Iterator[LocatedRecord]:
@@ -916,7 +902,7 @@ def mcap_facts(path: Path, on_fault: FaultHandler | None) -> RecordingFacts:
     """Return what a file holds about itself, or defaults, also for what is damaged."""
     for entry in _entries_of(path, lambda fault: None):
         if isinstance(entry, Metadata) and entry.name == _FACTS:
-            read = partial(json.loads, entry.values.get("facts", ""))
+            read = partial(json.loads, entry.metadata.get("facts", ""))
             return RecordingFacts.read(path, read, on_fault)
         if isinstance(entry, McapMessage):
             break

@@ -560,7 +560,7 @@ class _Head:
         """Whether it is part of a head."""
         if isinstance(found, Metadata):
             if found.name == METADATA_NAME and self.table is None:
-                self.table = found.values
+                self.table = found.metadata
         elif found.topic == SESSION_TOPIC:
             self.table, self.has_message = _session_table(path, found), True
         elif name := RADAR_INFO.fullmatch(found.topic):
