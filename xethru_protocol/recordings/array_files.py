@@ -51,13 +51,11 @@ from xethru_protocol.operating_system import written_whole
 from xethru_protocol.recordings.clock import steady_times
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
-    MAT_MAGIC,
     NO_TIME_NS,
-    NPY_MAGIC,
-    ZIP_MAGIC,
     FaultHandler,
     RecordingError,
     RecordingFault,
+    format_by_magic,
     optional_packages,
     reading,
     report,
@@ -78,7 +76,6 @@ DTYPES: Mapping[FrameKind, np.dtype[Any]] = {
 }
 SUFFIXES = (".csv", ".mat", ".npz")
 _TEXT = ".txt"  # of complex numbers
-_MAGICS = {NPY_MAGIC: ".npy", ZIP_MAGIC: ".npz", MAT_MAGIC: ".mat"}
 _LONGEST_START = 1 << 16  # bytes; a line of numbers is shorter
 _AT_ONCE = 256  # frames of a file that are read together
 _LINES_AT_ONCE = 8  # a number as text is ten times as large
@@ -143,10 +140,10 @@ def _format_of(path: Path) -> str:
         start = stream.read(_LONGEST_START)
     lines = (line.strip().decode("latin-1") for line in start.splitlines())
     line = next((line for line in lines if line and not line.startswith("#")), "")
-    for magic, suffix in _MAGICS.items():
-        if start.startswith(magic):
-            return suffix
-    if is_vendor_file(path):
+    found = format_by_magic(start)
+    if found in (".npy", ".npz", ".mat"):
+        return found
+    if found is not None or is_vendor_file(path):
         return ""
     return _TEXT if _complex_row(line) else path.suffix if path.suffix in SUFFIXES else ""
 

@@ -11,16 +11,13 @@ from xethru_protocol.recordings.array_files import is_array_file
 from xethru_protocol.recordings.clock import steady_messages
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
-    MCAP_MAGIC,
-    RERUN_MAGIC,
-    WIRE_MAGIC,
     FaultHandler,
     RecordingContent,
     RecordingError,
     RecordingFacts,
     RecordingFault,
     TimedMessages,
-    is_like,
+    format_by_magic,
     optional_packages,
     reading,
 )
@@ -64,12 +61,6 @@ class RecordingSummary:
     faults: tuple[RecordingFault, ...]
 
 
-_MAGICS: dict[bytes, RecordingFormat] = {
-    WIRE_MAGIC: "wire",
-    MCAP_MAGIC: "mcap",
-}
-
-
 def recording_format(path: Path | str) -> RecordingFormat:
     """Return the format of a recording; RecordingError if there is nothing that this can read."""
     path = Path(path)
@@ -83,16 +74,15 @@ def recording_format(path: Path | str) -> RecordingFormat:
         if not path.is_file():  # a pipe would be waited for
             raise RecordingError(f"{path} is not a file; a recording is read from files only")
         with path.open("rb") as stream:
-            start = stream.read(8)
-    for magic, found in _MAGICS.items():
-        if is_like(start, magic):
-            return found
+            found = format_by_magic(stream.read(16))
+    if found in ("mcap", "wire"):
+        return found
     if is_array_file(path):
         raise RecordingError(
             f"{path} is read for arrays only, by xethru_protocol.load and 'xethru convert';"
             f" messages are kept in .mcap"
         )
-    if start.startswith(RERUN_MAGIC):
+    if found == "rerun":
         raise RecordingError(f"{path} is a view in Rerun's format; 'uwb-slam view' opens it")
     raise RecordingError(
         f"{path} is not a recording: those are .mcap, .xtwire, arrays (.npz, .npy, .mat, .csv), and"

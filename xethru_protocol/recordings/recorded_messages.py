@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from io import FileIO
 from operator import ne
 from pathlib import Path
-from typing import Any, Self, get_type_hints
+from typing import Any, Literal, Self, get_type_hints
 
 from xethru_protocol.optional_packages import what_is_missing
 from xethru_protocol.validation import reason_of, shown
@@ -87,6 +87,27 @@ def writing(path: object) -> Iterator[None]:
 def is_like(head: bytes, magic: bytes) -> bool:
     """Whether a file begins with a magic number, one damaged byte allowed."""
     return len(head) == len(magic) and sum(map(ne, head, magic)) <= 1
+
+
+MagicFormat = Literal["mcap", "wire", "rerun", ".npy", ".npz", ".mat"]
+_MAGICS: Mapping[bytes, MagicFormat] = {
+    MCAP_MAGIC: "mcap",
+    WIRE_MAGIC: "wire",
+    RERUN_MAGIC: "rerun",
+    NPY_MAGIC: ".npy",
+    ZIP_MAGIC: ".npz",
+    MAT_MAGIC: ".mat",
+}
+_SHORT = 4  # bytes, of which one damaged one would leave too little
+
+
+def format_by_magic(start: bytes) -> MagicFormat | None:
+    """Return the format of a file that begins so; None if it has no magic number."""
+    for magic, found in _MAGICS.items():
+        head = start[: len(magic)]
+        if head == magic or (len(magic) > _SHORT and is_like(head, magic)):
+            return found
+    return None
 
 
 class GrowingFile:

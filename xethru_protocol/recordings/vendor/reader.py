@@ -28,19 +28,14 @@ import numpy.typing as npt
 
 from xethru_protocol.recordings.clock import counter_of, steady_messages, steady_times
 from xethru_protocol.recordings.recorded_messages import (
-    MAT_MAGIC,
-    MCAP_MAGIC,
     MS_NS,
-    NPY_MAGIC,
-    RERUN_MAGIC,
-    WIRE_MAGIC,
-    ZIP_MAGIC,
     FaultHandler,
     RecordingError,
     RecordingFacts,
     RecordingFault,
     Timed,
     TimedMessages,
+    format_by_magic,
     is_like,
     reading,
     report,
@@ -167,11 +162,6 @@ def _kind_of_entry(entry: Entry) -> DataFileKind | None:
     return KIND_OF_TYPE.get(entry.data_type) or KIND_OF_TYPE.get(entry.data_type ^ ALL_BITS)
 
 
-# What follows the magic numbers of others may look like any records.
-_LONG_MAGICS = (WIRE_MAGIC, MCAP_MAGIC, NPY_MAGIC, MAT_MAGIC)
-_SHORT_MAGICS = (ZIP_MAGIC, RERUN_MAGIC)  # where one damaged byte would leave too little
-
-
 def is_vendor_file(path: Path) -> bool:
     return path.name == META_NAME or kind_of_data_file(path) is not None
 
@@ -186,8 +176,7 @@ def kind_of_data_file(path: Path) -> DataFileKind | None:
         return kind
     with path.open("rb") as stream:
         start = stream.read(2 * _LARGEST_PLAUSIBLE_RECORD)
-    is_other = any(is_like(start[: len(magic)], magic) for magic in _LONG_MAGICS)
-    if is_other or start.startswith(_SHORT_MAGICS):
+    if format_by_magic(start) is not None:  # what follows it may look like any records
         return None
     size = path.stat().st_size
     found = [
