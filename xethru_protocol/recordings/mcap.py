@@ -47,6 +47,7 @@ from xethru_protocol.recordings.recorded_messages import (
     MCAP_MAGIC,
     MODULE_METRES,
     FaultHandler,
+    PieceFile,
     RecordingContent,
     RecordingError,
     RecordingFacts,
@@ -576,14 +577,14 @@ class McapWriter(Writer):
 
     def __init__(
         self,
-        stream: BinaryIO,
+        stream: BinaryIO | PieceFile,
         *,
         chunk_bytes: int = CHUNK_BYTES,
         profile: str = "ros2",
         library: str = "xethru-hil",
     ) -> None:
         super().__init__(
-            stream,
+            stream,  # type: ignore[arg-type]  # only write, tell and flush are used
             chunk_size=chunk_bytes,
             compression=CompressionType.ZSTD,
             enable_data_crcs=True,

@@ -113,16 +113,16 @@ def format_by_magic(start: bytes) -> MagicFormat | None:
 class GrowingFile:
     """A new file that grows by whole pieces, each handed to the operating system at once.
 
-    With ``flush`` each piece is on the disk before `append` returns. Creating it and every method
-    raise RecordingError if the file cannot be made or written.
+    With ``flush`` each piece is on the disk before `append` returns; with ``replace`` the file may
+    exist. Creating it and every method raise RecordingError if it cannot be made or written.
     """
 
-    def __init__(self, path: Path, *, flush: bool = False) -> None:
+    def __init__(self, path: Path, *, flush: bool = False, replace: bool = False) -> None:
         self.path = path
         self.size = 0
         self._flush = flush
         with writing(path):
-            self._stream = FileIO(path, "x")
+            self._stream = FileIO(path, "w" if replace else "x")
 
     def __enter__(self) -> Self:
         return self
@@ -158,7 +158,31 @@ class GrowingFile:
 
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
-        self._stream.close()
+        with writing(self.path):
+            self._stream.close()
+
+
+class PieceFile(GrowingFile):
+    """A `GrowingFile` as a stream; what is written to it waits until `hand_over` ends a piece."""
+
+    def __init__(self, path: Path, *, replace: bool = False) -> None:
+        super().__init__(path, replace=replace)
+        self._waiting = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.size + len(self._waiting)
+
+    def flush(self) -> None:
+        """Do nothing: `hand_over` ends a piece."""
+
+    def hand_over(self) -> None:
+        if self._waiting:
+            self.append(bytes(self._waiting))
+            self._waiting = bytearray()
 
 
 MS_NS = 1_000_000

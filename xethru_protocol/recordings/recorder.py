@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 from xethru_protocol.driver.matching import Listeners
 from xethru_protocol.recordings.recorded_messages import (
-    GrowingFile,
+    PieceFile,
     RecordingError,
     optional_packages,
 )
@@ -201,8 +201,8 @@ class SessionRecorder:
         self._flushed_ns = clock()
         self._lock = threading.Lock()
         self._closed = False
-        self._pieces = _Pieces(path)
-        self._writer = mcap.McapWriter(self._pieces)  # type: ignore[arg-type]  # writes, flush, tell
+        self._pieces = PieceFile(path)
+        self._writer = mcap.McapWriter(self._pieces)
         self._pieces.hand_over()
         self._radars: dict[str, RadarTopics] = {}
         self._texts: dict[str, int] = {}
@@ -253,29 +253,3 @@ class SessionRecorder:
 
 
 _CHUNK_NS = 1_000_000_000
-
-
-class _Pieces:
-    """A stream for mcap's writer whose bytes reach a new file in whole pieces."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = GrowingFile(path)
-        self._waiting = bytearray()
-
-    def write(self, data: bytes) -> int:
-        self._waiting += data
-        return len(data)
-
-    def tell(self) -> int:
-        return self._file.size + len(self._waiting)
-
-    def flush(self) -> None:
-        """Do nothing: `hand_over` ends a piece."""
-
-    def hand_over(self) -> None:
-        if self._waiting:
-            self._file.append(bytes(self._waiting))
-            self._waiting = bytearray()
-
-    def close(self) -> None:
-        self._file.close()

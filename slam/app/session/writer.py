@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,9 +52,7 @@ from xethru_protocol.recordings.mcap import (
     pack_array,
     pack_string,
 )
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
+from xethru_protocol.recordings.recorded_messages import PieceFile, RecordingError
 
 _ORIGIN = np.zeros(3)
 _CHUNK_NS = 1_000_000_000
@@ -95,17 +91,6 @@ class CannotWriteError(AppError):
     """The file cannot be written any further; the message describes what is kept."""
 
 
-class _Disk(FileIO):
-    """Writes until `gave_up` is set, and then discards, so that closing succeeds."""
-
-    gave_up = False
-
-    def write(self, data: ReadableBuffer, /) -> int:
-        if self.gave_up:
-            return memoryview(data).nbytes
-        return super().write(data)
-
-
 class _SessionFile(Topics):
     """An MCAP file of ROS 2 messages, in chunks that are cut by size and by time.
 
@@ -117,34 +102,29 @@ class _SessionFile(Topics):
         self.path = path
         self._start_ns = start_ns
         self._clock_ns = clock_ns
+        self._gave_up = False
         try:
-            self._disk = _Disk(path, "wb")
-        except OSError as error:
-            raise CannotWriteError(
-                f"{path}: cannot be written: {error.strerror or error}"
-            ) from None
-        self._stream = BufferedWriter(self._disk)
+            self._disk = PieceFile(path, replace=True)
+        except RecordingError as error:
+            raise CannotWriteError(str(error)) from None
         # Chunks are cut here, by size and by time; the writer itself knows size only.
-        self._writer = McapWriter(self._stream, chunk_bytes=2 * CHUNK_BYTES)
+        self._writer = McapWriter(self._disk, chunk_bytes=2 * CHUNK_BYTES)
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
-        self._whole_bytes = 0  # of the file, up to its last whole chunk
         self._newest_ns = self._whole_ns = start_ns
         self._chunk_started_ns = clock_ns()
 
     def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
-        with self._giving_up():
-            self._writer.add_metadata(name, dict(table))
+        self._writer.add_metadata(name, dict(table))
 
     def add_topic(self, topic: str, message_type: str, *, latched: bool = False) -> None:
         """Make a channel, if the topic has none yet; a latched one keeps its last message."""
-        if self._disk.gave_up or topic in self._channels:
+        if self._gave_up or topic in self._channels:
             return
         metadata = {"offered_qos_profiles": _LATCHED_QOS} if latched else {}
-        with self._giving_up():
-            self._channels[topic] = self._writer.add_channel(
-                topic, message_type, cdr.schema_text(message_type), metadata
-            )
+        self._channels[topic] = self._writer.add_channel(
+            topic, message_type, cdr.schema_text(message_type), metadata
+        )
 
     def write(
         self,
@@ -156,7 +136,7 @@ class _SessionFile(Topics):
         publish_ns: int | None = None,
     ) -> None:
         """Write a message in CDR at a session time [ns]; ``publish_ns`` is the same if None."""
-        if self._disk.gave_up:
+        if self._gave_up:
             return
         size = len(data) + _RECORD_OVERHEAD_BYTES
         late = self._clock_ns() - self._chunk_started_ns >= _CHUNK_NS
@@ -165,22 +145,20 @@ class _SessionFile(Topics):
             self.cut_chunk()
         self._pending_bytes += size
         self._newest_ns = max(self._newest_ns, t_ns)
-        with self._giving_up():
-            self._writer.add_message(
-                channel_id=self._channels[topic],
-                log_time=t_ns,
-                publish_time=t_ns if publish_ns is None else publish_ns,
-                sequence=sequence,
-                data=data,
-            )
+        self._writer.add_message(
+            channel_id=self._channels[topic],
+            log_time=t_ns,
+            publish_time=t_ns if publish_ns is None else publish_ns,
+            sequence=sequence,
+            data=data,
+        )
 
     def cut_chunk(self) -> None:
-        if self._disk.gave_up:
+        if self._gave_up:
             return
         with self._giving_up():
             self._writer.end_chunk()
-            self._stream.flush()
-            self._whole_bytes = self._disk.tell()
+            self._disk.hand_over()
         self._whole_ns = self._newest_ns
         self._pending_bytes = 0
         self._chunk_started_ns = self._clock_ns()
@@ -191,37 +169,32 @@ class _SessionFile(Topics):
         self._writer.has_copies = True
         with self._giving_up():
             self._writer.write_copy()
-            self._stream.flush()
-            self._whole_bytes = self._disk.tell()
+            self._disk.hand_over()
 
     def close(self) -> None:
         """Write index and footer, and close the file; doing so again does nothing."""
-        if self._stream.closed:
+        if self._disk.closed:
             return
         self.cut_chunk()
         with self._giving_up():
             self._writer.finish()
-            self._stream.close()
+            self._disk.hand_over()
+            self._disk.close()
 
     @contextlib.contextmanager
     def _giving_up(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
-            # the bytes of an incomplete chunk are useless, and their room is needed
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._disk.fileno(), self._whole_bytes)
-            self._disk.gave_up = True
-            self._stream.close()
+        except RecordingError as error:
+            self._gave_up = True
+            self._disk.close()
             kept = (
                 f"its first {(self._whole_ns - self._start_ns) / 1e9:.1f} s are kept there "
                 f"without an index: make room, then `uwb-slam repair {self.path}`"
                 if self._whole_ns > self._start_ns
                 else "nothing was recorded: make room"
             )
-            raise CannotWriteError(
-                f"{self.path}: cannot be written: {error.strerror or error}; {kept}"
-            ) from None
+            raise CannotWriteError(f"{error}; {kept}") from None
 
 
 class SessionLog(SessionObserver):

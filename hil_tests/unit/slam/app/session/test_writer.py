@@ -300,7 +300,7 @@ def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
 def test_a_full_disk_from_the_start_is_one_line() -> None:
-    with pytest.raises(CannotWriteError, match="/dev/full: cannot be written: No space") as caught:
+    with pytest.raises(CannotWriteError, match="/dev/full cannot be written: No space") as caught:
         SessionLog(Path("/dev/full"), session_info(), odometry(20))
     assert "nothing was recorded" in str(caught.value)
 
