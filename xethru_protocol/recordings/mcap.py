@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, Self, TypeAlias
 
 import lz4.frame
 import numpy as np
@@ -101,8 +101,40 @@ SCHEMAS = {
 """Definition of each message with all it refers to, as ``ros2msg`` text."""
 
 
+class CdrPacker:
+    """Bytes of a message in CDR, little-endian; numbers are aligned to their size."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+
+    def numbers(self, kind: str, *values: float) -> Self:
+        """Append numbers of one kind of `struct`."""
+        self._align(struct.calcsize(kind))
+        self._bytes += struct.pack(f"<{len(values)}{kind}", *values)
+        return self
+
+    def text(self, text: str) -> Self:
+        data = text.encode() + b"\0"
+        self.numbers("I", len(data))
+        self._bytes += data
+        return self
+
+    def array(self, values: npt.NDArray[Any]) -> Self:
+        """Append the numbers of an array; nothing, not even padding, if it has none."""
+        if values.size:
+            self._align(values.itemsize)
+            self._bytes += values.tobytes()
+        return self
+
+    def done(self) -> bytes:
+        return _LITTLE_ENDIAN + self._bytes
+
+    def _align(self, size: int) -> None:
+        self._bytes += bytes(-len(self._bytes) % size)
+
+
 def pack_string(text: str) -> bytes:
-    return _LITTLE_ENDIAN + _counted(text)
+    return CdrPacker().text(text).done()
 
 
 def pack_array(message_type: str, values: npt.NDArray[Any], label: str = "") -> bytes:
@@ -110,17 +142,9 @@ def pack_array(message_type: str, values: npt.NDArray[Any], label: str = "") -> 
 
     The dimension is called ``label``, by default "range_bin" for float32 and "byte" for bytes.
     """
-    dtype = _DTYPE[message_type]
-    count = _U32.pack(len(values))
-    text = _counted(label or _LABEL[message_type])
-    head = _U32.pack(1) + text + bytes(-len(text) % 4) + count + count + _U32.pack(0) + count
-    padding = bytes(-len(head) % dtype.itemsize) if len(values) else b""
-    return _LITTLE_ENDIAN + head + padding + np.ascontiguousarray(values, dtype).tobytes()
-
-
-def _counted(text: str) -> bytes:
-    data = text.encode() + b"\0"
-    return _U32.pack(len(data)) + data
+    message = CdrPacker().numbers("I", 1).text(label or _LABEL[message_type])
+    message.numbers("I", len(values), len(values), 0, len(values))
+    return message.array(np.asarray(values, _DTYPE[message_type])).done()
 
 
 def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:

@@ -8,7 +8,6 @@ millisecond for what takes some microseconds so. Arrays and texts are those of e
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -23,6 +22,7 @@ from slam.imaging.back_projection import Grid
 from slam.live.odometry_track import NS_PER_S, TumSample
 from slam.live.session_records import LogLine, RadarImage, Snapshot
 from slam.results import SmoothedRun
+from xethru_protocol.recordings.mcap import CdrPacker
 
 Array = NDArray[np.float64]
 Message: TypeAlias = Any  # rosbags makes its message classes at run time
@@ -79,46 +79,13 @@ def pose_sample(message: Message, *, with_covariance: bool = False) -> TumSample
     )
 
 
-_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-
-
-class _Packer:
-    """Bytes of a message in CDR, little-endian; numbers are aligned to their size."""
-
-    def __init__(self) -> None:
-        self._bytes = bytearray()
-
-    def numbers(self, kind: str, *values: float) -> Self:
-        """Append numbers of one kind of `struct`."""
-        self._align(struct.calcsize(kind))
-        self._bytes += struct.pack(f"<{len(values)}{kind}", *values)
-        return self
-
-    def text(self, text: str) -> Self:
-        data = text.encode() + b"\0"
-        self.numbers("I", len(data))
-        self._bytes += data
-        return self
-
-    def array(self, values: NDArray[Any]) -> Self:
-        """Append the numbers of an array; nothing, not even padding, if it has none."""
-        if values.size:
-            self._align(values.itemsize)
-            self._bytes += values.tobytes()
-        return self
-
+class _Packer(CdrPacker):
     def stamp(self, t_ns: int) -> Self:
         seconds, rest = divmod(int(t_ns), NS_PER_S)
         return self.numbers("i", seconds).numbers("I", rest)
 
     def header(self, t_ns: int, frame: str) -> Self:
         return self.stamp(t_ns).text(frame)
-
-    def done(self) -> bytes:
-        return _LITTLE_ENDIAN + self._bytes
-
-    def _align(self, size: int) -> None:
-        self._bytes += bytes(-len(self._bytes) % size)
 
 
 def number(value: int) -> bytes:
