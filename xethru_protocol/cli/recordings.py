@@ -43,7 +43,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.array_files import SUFFIXES, is_array_file
-from xethru_protocol.recordings.recorded_messages import writing
+from xethru_protocol.recordings.recorded_messages import doing, writing
 from xethru_protocol.recordings.vendor.reader import data_files
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
 from xethru_protocol.validation import shown, suffix_of
@@ -337,11 +337,8 @@ def export(arguments: Namespace) -> int:
         arguments.refuse(f"{arguments.tool} gets a file *{wanted}, not {arguments.out}")
     if Path(arguments.out).exists() and not arguments.force:
         raise CommandFailed(f"{arguments.out} exists already; --force replaces it")
-    try:
-        with written_whole(Path(arguments.out)) as fresh:
-            fresh.write_text(text, "utf-8")
-    except OSError as error:
-        raise CommandFailed(f"{arguments.out} cannot be written: {error.strerror}") from None
+    with writing(arguments.out), written_whole(Path(arguments.out)) as fresh:
+        fresh.write_text(text, "utf-8")
     return 0
 
 
@@ -366,10 +363,8 @@ def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
 def remove_older(targets: Sequence[Path], *, replace: bool) -> None:
     """Remove what `files_to_replace` finds, with the directories that are empty then."""
     for path in files_to_replace(targets, replace=replace):
-        try:
+        with doing("removed", path):
             path.unlink()
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
     for target in targets:
         remove_empty_directories(target)
 

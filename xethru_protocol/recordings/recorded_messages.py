@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from io import FileIO
 from operator import ne
 from pathlib import Path
@@ -67,21 +68,15 @@ def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
 
 
 @contextmanager
-def reading(path: object) -> Iterator[None]:
-    """Turn an error of the operating system into one that names the file that is read."""
+def doing(what: str, path: object) -> Iterator[None]:
+    """Turn an error of the operating system into one that says what cannot be done to a file."""
     try:
         yield
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise RecordingError(f"{path} cannot be {what}: {error.strerror or error}") from None
 
 
-@contextmanager
-def writing(path: object) -> Iterator[None]:
-    """Turn an error of the operating system into one that names the file that is written."""
-    try:
-        yield
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+reading, writing = partial(doing, "read"), partial(doing, "written")
 
 
 def is_like(head: bytes, magic: bytes) -> bool:

@@ -90,17 +90,12 @@ class BinaryKind(_DataFileKind):
     titles: ClassVar[bytes] = b""
     header: np.dtype[np.void]  # the message's fields before its elements, packed
     count: str  # header field that counts the elements
-    columns: int  # values per element: 2 where all of one column come before all of the other
-    values: str  # numpy type of one value
+    element_bytes: int  # of all columns, where all of one come before all of the other
 
     @property
     def prefix(self) -> bytes:
         """Codes that the payload begins with and the record leaves out."""
         return ROWS[self.message].prefix
-
-    @property
-    def element_bytes(self) -> int:
-        return self.columns * np.dtype(self.values).itemsize
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the record of a message; its time stands in the meta file only."""
@@ -118,13 +113,14 @@ def _binary(name: str, bit: int, message: type[Response]) -> BinaryKind:
     elements = [kind for _, kind in kinds if not isinstance(kind, fields.Number)]
     match elements[0]:
         case fields.Bins(count_field=count, dtype=dtype):
-            values = dtype.str
+            value_bytes = dtype.itemsize
         case fields.Block(count=count):
-            values = "u1"
+            value_bytes = 1
         case fields.Elements(count_label=count, code=code):  # a u32 count comes before them
             header.append((count, "<u4"))
-            values = "<f4" if code == "a" else "u1"
-    return BinaryKind(name, 1 << bit, message, np.dtype(header), count, len(elements), values)
+            value_bytes = 4 if code == "a" else 1
+    element_bytes = len(elements) * value_bytes
+    return BinaryKind(name, 1 << bit, message, np.dtype(header), count, element_bytes)
 
 
 BINARY_KINDS = (

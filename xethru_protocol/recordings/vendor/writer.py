@@ -376,18 +376,14 @@ class RecordingWriter:
 
     def _part_at(self, time_ms: int) -> _OpenDirectory:
         """Return the directory that takes the next record; a new one where the last is full."""
-        part, split, zone = self._part, self._split_directories, self._timezone
-        if part is not None and split is None:
-            return part
-        if (
-            part is not None
-            and split is not None
-            and not split.is_full(part.records, part.meta.size)
-            and not split.is_over(part.meta.start_ms, time_ms, zone)
+        part, split, zone = self._part, self._split_directories or Split(), self._timezone
+        if part is not None and not (
+            split.is_full(part.records, part.meta.size)
+            or split.is_over(part.meta.start_ms, time_ms, zone)
         ):
             return part
         directory = self.directory
-        if split is not None:
+        if self._split_directories is not None:
             name = session_directory(directory, self.session_id, time_ms * MS_NS, zone).name
             directory = directory / f"{name}_{self._parts}"
             with writing(directory):
