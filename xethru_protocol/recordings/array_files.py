@@ -283,14 +283,8 @@ def _kind_in(names: Iterable[str]) -> FrameKind:
 
 def _beside(frames: Frames) -> dict[str, npt.NDArray[Any]]:
     """Return the known arrays beside the samples, by name."""
-    rate_hz = frames.frame_rate_hz
-    arrays = {
-        "t_ns": frames.t_ns,
-        "counter": frames.counter,
-        "ranges_m": frames.ranges_m,
-        "frame_rate_hz": None if rate_hz is None else np.array(rate_hz),
-    }
-    return {name: values for name, values in arrays.items() if values is not None}
+    known = {name: getattr(frames, name) for name in _VECTORS}
+    return {name: np.asarray(values) for name, values in known.items() if values is not None}
 
 
 # --- .npz ---------------------------------------------------------------------------------------

@@ -24,11 +24,9 @@ from xethru_protocol.recordings.recorded_messages import (
     FaultHandler,
     RecordingError,
     RecordingFault,
-    TimedMessages,
     report,
 )
 from xethru_protocol.wire.messages import DataFloat
-from xethru_protocol.wire.table import Response
 
 Item = TypeVar("Item")
 _REMEMBERED = 64  # times that show how long a step of the counter lasts
@@ -164,7 +162,7 @@ def _seconds(t_ns: int) -> str:
     return f"{t_ns * 1e-9:.3f}"
 
 
-def counter_of(message: Response) -> tuple[str, int] | None:
+def counter_of(message: object) -> tuple[str, int] | None:
     """Return the frame counter of a message with its type; None if it has none."""
     if isinstance(message, DataFloat):
         return ("DataFloat", message.info) if message.content_id == 0 else None
@@ -176,11 +174,11 @@ def steady(
     rows: Iterable[tuple[Item, int | None]],
     file: str,
     on_fault: FaultHandler | None,
-    count: Callable[[Item], tuple[str, int] | None],
+    count: Callable[[Item], tuple[str, int] | None] = counter_of,
 ) -> Iterator[tuple[Item, int | None]]:
     """Yield what a recorder stored with times that do not fall; what was put right is reported.
 
-    ``count`` gives an item's counter as `counter_of` does. What has no time stays without one.
+    ``count`` gives the counter of an item that is no message. What has no time stays without one.
     """
 
     def note(number: int, text: str) -> None:
@@ -188,12 +186,6 @@ def steady(
         report(RecordingFault(file=file, offset=0, reason=reason, minor=True), on_fault)
 
     return _Clock(count, note).right(rows)
-
-
-def steady_messages(
-    messages: TimedMessages, file: str, on_fault: FaultHandler | None
-) -> TimedMessages:
-    return steady(messages, file, on_fault, counter_of)
 
 
 def steady_times(

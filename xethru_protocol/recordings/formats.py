@@ -8,7 +8,7 @@ from typing import Literal
 
 from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.array_files import is_array_file
-from xethru_protocol.recordings.clock import steady_messages
+from xethru_protocol.recordings.clock import steady
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
 from xethru_protocol.recordings.recorded_messages import (
     FaultHandler,
@@ -117,12 +117,12 @@ def read_recording(
     match found:
         case "wire":
             messages = wire_capture.read_wire(path, on_fault)
-            yield from steady_messages(messages, path.name, on_fault)
+            yield from steady(messages, path.name, on_fault)
         case "mcap":
             with optional_packages():
                 from xethru_protocol.recordings.mcap import read_mcap
 
-            yield from steady_messages(read_mcap(path, on_fault, radar), path.name, on_fault)
+            yield from steady(read_mcap(path, on_fault, radar), path.name, on_fault)
         case "vendor":
             yield from read_vendor(path, on_fault)
 

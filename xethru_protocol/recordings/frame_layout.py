@@ -179,11 +179,11 @@ class FrameGeometries:
         return None  # they are missing, or of another time
 
 
-def samples_of(frame: FrameMessage) -> npt.NDArray[Any]:
-    """Return RF or complex baseband, shape (n_bins,); of DATA FLOAT the values as sent."""
+def samples_of(frame: FrameMessage, *, downconversion: bool) -> npt.NDArray[Any]:
+    """Return RF or complex baseband, shape (n_bins,); ``downconversion`` is that of DATA FLOAT."""
     match frame:
-        case DataFloat():
-            return frame.values
+        case DataFloat(values=values):
+            return complex_of(*np.split(values, 2)) if downconversion else values
         case BasebandAp(amplitude=amplitude, phase=phase):
             return complex_of(amplitude * np.cos(phase), amplitude * np.sin(phase))
         case BasebandIq(i=i, q=q):

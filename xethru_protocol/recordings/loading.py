@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.driver.frames import FrameGeometry, complex_of
+from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.driver.link import CONFIG_SETTINGS
 from xethru_protocol.recordings.array_files import (
     DTYPES,
@@ -430,10 +430,7 @@ class _Messages:
     def _chunks(self, layout: _ArrayLayout, kind: FrameKind | None) -> Iterator[Samples]:
         for found, frame, _ in self._rows(lambda fault: None):
             if found == layout:
-                values = samples_of(frame)
-                if kind == "iq" and values.dtype != np.complex64:
-                    values = complex_of(*np.split(values, 2))
-                yield values[np.newaxis]
+                yield samples_of(frame, downconversion=kind == "iq")[np.newaxis]
 
     def _rows(
         self, on_fault: FaultHandler, layouts: FrameLayouts | None = None

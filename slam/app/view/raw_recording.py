@@ -186,11 +186,11 @@ class _Drawing:
                     self._add(message, values, None, None, t_ns)
                     return
                 place = (geometry.range_start_m, geometry.bin_length_m)
-                samples = complex_of(*np.split(values, 2)) if geometry.downconversion else values
+                samples = samples_of(message, downconversion=geometry.downconversion)
                 self._add(message, samples, geometry.downconversion, place, t_ns)
             case m.BasebandIq() | m.BasebandAp() | m.RadarMessage():
                 self._counter = message.counter
-                samples = samples_of(message)
+                samples = samples_of(message, downconversion=False)
                 place = (message.range_offset_m, message.bin_length_m)
                 self._add(message, samples, np.iscomplexobj(samples), place, t_ns)
             case _:

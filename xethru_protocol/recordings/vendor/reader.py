@@ -26,7 +26,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol.recordings.clock import counter_of, steady_messages, steady_times
+from xethru_protocol.recordings.clock import counter_of, steady, steady_times
 from xethru_protocol.recordings.recorded_messages import (
     MS_NS,
     FaultHandler,
@@ -504,7 +504,7 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """
     parts = _parts_of(path)
     if all(part.meta for part in parts):
-        yield from steady_messages(_messages(path, parts, on_fault), path.name, on_fault)
+        yield from steady(_messages(path, parts, on_fault), path.name, on_fault)
     else:  # file by file, so that times of the next begin before those of the last end
         yield from _messages(path, parts, on_fault)
 
@@ -530,7 +530,7 @@ def _messages(
                 yield from heapq.merge(*map(_rest, files), key=lambda timed: timed[1] or 0)
             else:
                 for file in files:
-                    yield from steady_messages(_rest(file), file.path.name, on_fault)
+                    yield from steady(_rest(file), file.path.name, on_fault)
         finally:
             for file in files:
                 file.close()
@@ -615,9 +615,8 @@ def _files_by_entry(
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
-    first, *rest = _parts_of(path)
-    meta = first.meta
-    last = rest[-1].meta if rest else meta
+    parts = _parts_of(path)
+    first, meta, last = parts[0], parts[0].meta, parts[-1].meta
     parameters = first.directory / PARAMETER_FILE_NAME
     with reading(parameters):
         parameter_file = parameters.read_bytes() if parameters.is_file() else None

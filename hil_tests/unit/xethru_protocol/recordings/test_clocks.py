@@ -26,7 +26,7 @@ from xethru_protocol.recordings import (
     convert,
     load,
 )
-from xethru_protocol.recordings.clock import steady_messages
+from xethru_protocol.recordings.clock import steady
 from xethru_protocol.recordings.mcap import write_mcap
 from xethru_protocol.recordings.recorded_messages import TimedMessages
 from xethru_protocol.wire import messages as m
@@ -114,7 +114,7 @@ def test_one_damaged_time_does_not_move_the_others(
 def test_without_a_counter_times_go_on_and_the_note_says_so() -> None:
     timed = [(m.Ack(), second * 10**9) for second in (5, 6, 7, 1, 2)]
     faults: list[RecordingFault] = []
-    found = [t_ns for _, t_ns in steady_messages(iter(timed), "a", faults.append)]
+    found = [t_ns for _, t_ns in steady(iter(timed), "a", faults.append)]
     assert found == [5 * 10**9, 6 * 10**9, 7 * 10**9, 7 * 10**9, 8 * 10**9]
     assert len(faults) == 1
 
@@ -192,7 +192,7 @@ def test_an_error_comes_behind_all_messages_before_it() -> None:
         yield from timed
         raise RecordingError("cut")
 
-    read = steady_messages(cut(), "a.xtwire", None)
+    read = steady(cut(), "a.xtwire", None)
     assert list(itertools.islice(read, len(timed))) == timed
     with pytest.raises(RecordingError):
         next(iter(read))
