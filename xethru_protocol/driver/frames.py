@@ -312,8 +312,8 @@ class Frame:
 
 
 def complex_of(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
-    """Return I + jQ, shape (n,); parts are kept beside infinities, which 1j * q does not."""
-    iq = np.empty(i.size, np.complex64)
+    """Return I + jQ of equal shapes; parts are kept beside infinities, which 1j * q does not."""
+    iq = np.empty(i.shape, np.complex64)
     iq.real = i
     iq.imag = q
     return iq

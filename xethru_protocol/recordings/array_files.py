@@ -47,6 +47,7 @@ from numpy.lib.format import (
     write_array_header_1_0,
 )
 
+from xethru_protocol.driver.frames import complex_of
 from xethru_protocol.operating_system import written_whole
 from xethru_protocol.recordings.clock import steady_times
 from xethru_protocol.recordings.frame_layout import FrameLayout, FrameLayouts
@@ -394,8 +395,7 @@ def _read_npy(path: Path, downconversion: bool | None) -> Frames:
         for begin in range(0, len(values), _AT_ONCE):
             rows = values[begin : begin + _AT_ONCE]
             if kind == "iq" and values.dtype.kind != "c":
-                halves = np.split(rows.astype(np.float32), 2, axis=1)
-                rows = np.stack(halves, axis=-1).view(np.complex64)[..., 0]
+                rows = complex_of(*np.split(rows.astype(np.float32), 2, axis=1))
             yield rows.astype(DTYPES[kind or "rf"])
 
     shape = len(values), n_bins
@@ -597,12 +597,7 @@ def _read_csv(path: Path, note: Callable[[str], None]) -> Frames:
             while several := list(itertools.islice(whole, _LINES_AT_ONCE)):
                 cells = [[row[at] for at in wanted] for row in several]
                 values = np.array(cells, dtype="U").astype(np.float32)
-                if kind == "rf":
-                    yield values
-                    continue
-                iq = np.empty((len(values), n_bins), np.complex64)
-                iq.real, iq.imag = values[:, :n_bins], values[:, n_bins:]
-                yield iq
+                yield values if kind == "rf" else complex_of(*np.split(values, 2, axis=1))
 
     return _frames(path, kind, (n_frames, n_bins), DTYPES[kind], chunks=chunks, beside=beside)
 

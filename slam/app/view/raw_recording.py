@@ -253,8 +253,7 @@ class _Drawing:
             layout = self._layouts.layouts()[samples.shape[1]]
             block.is_complex = bool(layout.downconversion)
         if block.is_complex and not np.iscomplexobj(samples):
-            i, q = np.split(samples, 2, axis=1)
-            samples = complex_of(i.ravel(), q.ravel()).reshape(i.shape)
+            samples = complex_of(*np.split(samples, 2, axis=1))
         ranges_m = self._ranges_m(block, samples.shape[1])
         values = (np.abs(samples), np.angle(samples)) if block.is_complex else (samples,)
         charts = dict(zip(block.charts, values, strict=True))

@@ -535,12 +535,12 @@ def _messages(
             for file in files:
                 file.close()
     if meta is not None and meta.next_name and path.name == META_NAME:
-        fault = f"the recording goes on in {meta.next_name}, which is missing"
-        report(RecordingFault(file=META_NAME, offset=0, reason=fault), on_fault)
+        reason = f"the recording goes on in {meta.next_name}, which is missing"
+        _report_meta(reason, on_fault, minor=False)
 
 
-def _report_meta(reason: str, on_fault: FaultHandler | None) -> None:
-    report(RecordingFault(file=META_NAME, offset=0, reason=reason, minor=True), on_fault)
+def _report_meta(reason: str, on_fault: FaultHandler | None, *, minor: bool = True) -> None:
+    report(RecordingFault(file=META_NAME, offset=0, reason=reason, minor=minor), on_fault)
 
 
 def _along_index(meta: Meta, file_of: Callable[[Entry], _DataFileReader | None]) -> Iterator[Timed]:
@@ -723,18 +723,15 @@ class RecordingReader:
     meta_version = VERSION
 
     def __init__(self, path: Path | str) -> None:
-        path = Path(path)
-        metas: list[Meta] = []
-        self._files: list[dict[tuple[int, int], tuple[Path, DataFileKind]]] = []
-        parts = _parts_of(path)
+        parts = _parts_of(Path(path))
         for part in parts:
             if part.meta is None:
                 raise RecordingError(
                     f"{part.directory} has no {META_NAME} to read by, {part.problem}; "
                     "read_recording does without"
                 )
-            metas.append(part.meta)
-            self._files.append(part.files_by_number())
+        metas = [part.meta for part in parts if part.meta is not None]
+        self._files = [part.files_by_number() for part in parts]
         first, last = metas[0], metas[-1]
         self.start_ns = first.start_ms * MS_NS
         self.session_id = first.session_id.decode("utf-8", "replace")
