@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -93,7 +93,7 @@ class _RecordingDirectory:
     meta: Meta | None
     problem: str
 
-    def files_by_number(self) -> dict[tuple[int, int], tuple[Path, DataFileKind]]:
+    def files_by_number(self) -> dict[tuple[int, int], Path]:
         """Return the data files of the index by data type and number.
 
         Where the list of files is missing, those of a type in their order.
@@ -101,7 +101,7 @@ class _RecordingDirectory:
         meta = self.meta or Meta()
         entries = np.frombuffer(meta.index, ENTRY)
         on_disk = _data_files(self.directory, meta)
-        found: dict[tuple[int, int], tuple[Path, DataFileKind]] = {}
+        found: dict[tuple[int, int], Path] = {}
         for bit in map(int, np.unique(entries["data_type"])):
             kind = KIND_OF_TYPE.get(bit)
             if kind is None:
@@ -109,10 +109,8 @@ class _RecordingDirectory:
             same = [path for path, other in on_disk.items() if other is kind]
             numbers = map(int, np.unique(entries["file"][entries["data_type"] == bit]))
             for at, number in enumerate(numbers):
-                path = self.listed_path(bit, number)
-                if number >= len(meta.files) and at < len(same):
-                    path = same[at]
-                found[bit, number] = path, kind
+                is_listed = number < len(meta.files) or at >= len(same)
+                found[bit, number] = self.listed_path(bit, number) if is_listed else same[at]
         return found
 
     def listed_path(self, data_type: int, number: int) -> Path:
@@ -595,21 +593,20 @@ def _files_by_entry(
     Where the ``whole`` recording is read, a file that is listed and not there is reported once.
     """
     by_path = {file.path: file for file in files}
-    found: dict[tuple[int, int], _DataFileReader | None] = {}
     known = part.files_by_number()
+
+    @cache
+    def file_at(data_type: int, number: int) -> _DataFileReader | None:
+        path = known.get((data_type, number)) or part.listed_path(data_type, number)
+        if path not in by_path and whole:
+            problem = "it is missing" if data_type in KIND_OF_TYPE else "its layout is not known"
+            reason = f"the index lists it, and {problem}"
+            report(RecordingFault(file=path.name, offset=0, reason=reason), on_fault)
+        return by_path.get(path)
 
     def file_of(entry: Entry) -> _DataFileReader | None:
         kind = _kind_of_entry(entry)
-        key = (kind.data_type if kind else entry.data_type, entry.file)
-        if key in found:
-            return found[key]
-        path = known[key][0] if key in known else part.listed_path(*key)
-        found[key] = by_path.get(path)
-        if found[key] is None and whole:
-            problem = "it is missing" if kind is not None else "its layout is not known"
-            reason = f"the index lists it, and {problem}"
-            report(RecordingFault(file=path.name, offset=0, reason=reason), on_fault)
-        return found[key]
+        return file_at(kind.data_type if kind else entry.data_type, entry.file)
 
     return file_of
 
@@ -886,14 +883,15 @@ class RecordingReader:
     def _read(self, at: int) -> tuple[Response, bytes]:
         entry = self._entries[at]
         size = int(entry["size"])
-        path, kind = self._files[self._in_part[at]][int(entry["data_type"]), int(entry["file"])]
+        bit = int(entry["data_type"])
+        path = self._files[self._in_part[at]][bit, int(entry["file"])]
         with reading(path):
             stream = self._streams.get(path)
             if stream is None:
                 stream = self._streams[path] = self._exits.enter_context(path.open("rb"))
             stream.seek(int(entry["begin"]))
             data = stream.read(size)
-        return _message(path, kind, data, size), data
+        return _message(path, KIND_OF_TYPE[bit], data, size), data
 
 
 def _message(path: Path, kind: DataFileKind, data: bytes, size: int) -> Response:
