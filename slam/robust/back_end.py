@@ -921,14 +921,16 @@ class RobustBackEnd:
 
     def _place_point(self, tentative: TentativePoint, point: BodyPoint, row: int | None) -> None:
         """Update the landmark in a row with a tentative one, or add it to the map."""
-        state, ranges = self.state, None
+        state, ranges, radius = self.state, None, None
+        if state.radius_sigma_m and row is None:
+            radius = tentative.radius(state.radius_sigma_m)
         if tentative.is_of_patches:
             side = self._sides[self._side_of[tentative.seen[-1].radar]]
-            ranges = self._unassigned.fit(tentative.point, side, state)
+            radius_m = (radius or (0.0,))[0] if row is None else float(state.feature_radii_m[row])
+            ranges = self._unassigned.fit(tentative.point, side, state, radius_m=radius_m)
         if ranges is not None:
             point = self._as_uncertain(ranges.point)
         if row is None:
-            radius = tentative.radius(state.radius_sigma_m) if state.radius_sigma_m else None
             landmark_id = initialise_landmark(state, point, radius)
             if tentative.label is not None:
                 self._landmark_of_label[tentative.label] = landmark_id

@@ -148,6 +148,10 @@ class _Looks:
         off = np.abs(wrap_angles(np.arctan2(u[:, 1], u[:, 0]) - self.yaws_rad))
         return self.ranges_m - distance - J[:, 2:] @ errors[2:], J, off
 
+    def of_axis(self, radius_m: float) -> _Looks:
+        """Return them as ranges of the axis of what has a radius."""
+        return replace(self, ranges_m=self.ranges_m + radius_m)
+
     def nearest(self, misses_m: Array) -> Indices:
         """Return where the least of all misses (k,) [m] in each frame of each radar is.
 
@@ -255,13 +259,20 @@ class UnassignedRanges:
         return [(radar, *one) for one in rows[["range_m", "sigma_m"]].tolist()]
 
     def fit(
-        self, point: BodyPoint, radars: Sequence[int], state: State, *, is_of_ranges: bool = False
+        self,
+        point: BodyPoint,
+        radars: Sequence[int],
+        state: State,
+        *,
+        radius_m: float = 0.0,
+        is_of_ranges: bool = False,
     ) -> FittedRanges | None:
         """Return which ranges of some radars are of a point, and where they put it.
 
         Point and unknowns of the radars are fitted, some times, to the nearest range of each radar
-        in each frame, of those in the gate. A point that is itself of these ranges is where they
-        are looked for at first, and no more. None if they are too few, or hit too few of the frames
+        in each frame, of those in the gate. With a radius, what is fitted is the axis behind the
+        point: ranges end at the surface. A point that is itself of these ranges is where they are
+        looked for at first, and no more. None if they are too few, or hit too few of the frames
         with the point in view, or do not fit.
         """
         rule, noise = self._parameters.initialisation, self._parameters.ranges
@@ -271,11 +282,14 @@ class UnassignedRanges:
         of_radars = np.asarray(np.linalg.inv(of_radars + _FLOOR * np.eye(len(of_radars))))
         prior = _prior(point, of_radars)
         known, errors = np.linalg.inv(prior), np.zeros(len(prior))
+        axis_m = point.point_m
+        if radius_m and point.outward is not None:
+            axis_m, looks = axis_m + radius_m * point.outward, looks.of_axis(radius_m)
         if is_of_ranges:
             prior = np.pad(of_radars, ((2, 0), (2, 0)))
             prior[0, 0] = prior[1, 1] = 1.0 / noise.max_range_m**2  # in range, wherever
         for fits in range(_FITS):
-            residual, J, off = looks.at_point(point.point_m, errors)
+            residual, J, off = looks.at_point(axis_m, errors)
             S = looks.variances + np.sum((J @ known) * J, axis=1)
             is_near = np.square(residual) <= rule.gate_sigmas**2 * S  # no NaN is
             is_near &= off <= noise.field_of_view_rad / 2 + rule.edge_rad
@@ -289,8 +303,8 @@ class UnassignedRanges:
         counts = np.unique(looks.rows["radar"][k], return_counts=True)[1]
         if len(counts) < min(len(radars), 2) or counts.min() < rule.min_hits_per_radar:
             return None
-        residual, J, off = looks.at_point(point.point_m, errors)
-        if looks.share_hit(k, point.point_m + errors[:2], noise) < rule.min_share:
+        residual, J, off = looks.at_point(axis_m, errors)
+        if looks.share_hit(k, axis_m + errors[:2], noise) < rule.min_share:
             return None
         chi_square = float(np.sum(np.square(residual[k]) / looks.variances[k]))
         chi_square += float(errors @ prior @ errors)
@@ -299,12 +313,15 @@ class UnassignedRanges:
         # For the unknowns of the radars as they are in the state
         covariance = np.asarray(np.linalg.inv(information[:2, :2]))
         by_offsets = -covariance @ information[:2, 2:]
-        target = point.point_m + errors[:2] - by_offsets @ errors[2:]
-        away = target - looks.antennas_m[k].mean(axis=0)
+        axis_m = axis_m + errors[:2] - by_offsets @ errors[2:]
+        away = axis_m - looks.antennas_m[k].mean(axis=0)
         outward = away / max(math.hypot(away[0], away[1]), _LEAST_WAY_M)
         return FittedRanges(
             point=BodyPoint(
-                point_m=target, covariance=covariance, by_offsets=by_offsets, outward=outward
+                point_m=axis_m - radius_m * outward,
+                covariance=covariance,
+                by_offsets=by_offsets,
+                outward=outward,
             ),
             rows=looks.rows[k],
             at=at[k],

@@ -439,8 +439,8 @@ def lone_landmark() -> RobustBackEnd:
         point_m=np.array([0.0, 1.0]), covariance=1e-6 * np.eye(2), by_offsets=np.zeros((2, 4))
     )
     for k in range(12):
-        back_end.predict(np.array([1e-3, 0.0, 0.0]))
-        at = np.array([1e-3 * (k + 1), 0.0])
+        back_end.predict(np.array([1e-2, 0.0, 0.0]))
+        at = np.array([1e-2 * (k + 1), 0.0])
         scans = []
         for radar in LEFT:
             mount = paper_rig().mounts[radar]

@@ -176,6 +176,23 @@ def test_a_point_hits_most_frames_that_have_it_in_view(n_frames: int, is_point: 
     assert (unassigned.fit(near(target), LEFT, state_of()) is not None) == is_point
 
 
+def test_ranges_of_what_is_round_end_at_its_surface() -> None:
+    """Exact ones of a cylinder: the point is where a line from the antennas to its axis enters."""
+    radius_m, axis = 0.1, np.array([0.1, 0.8])
+    unassigned, places, _ = ranged(lambda at: float(np.hypot(*(axis - at))) - radius_m)
+    back = np.array([STEP_M * (FEW - 1), 0.0])
+    outward = axis - places.mean(axis=0)
+    outward /= np.hypot(*outward)
+    surface = axis - radius_m * outward - back
+    guess = replace(near(np.add(surface, [0.005, -0.005])), outward=outward)
+    found = unassigned.fit(guess, LEFT, state_of(), radius_m=radius_m)
+    assert found is not None
+    assert found.point.point_m == pytest.approx(surface, abs=1e-3)
+    assert found.point.outward == pytest.approx(outward, abs=1e-3)
+    as_thin = unassigned.fit(guess, LEFT, state_of())
+    assert as_thin is None or as_thin.chi_square > 10.0 * found.chi_square
+
+
 def test_unknown_places_of_antennas_move_the_point_as_they_do() -> None:
     """By differences of points, from ranges that antennas elsewhere took while the robot turned."""
     target, turn_rad, step_m = np.array([0.1, 0.8]), 0.3, 1e-5
