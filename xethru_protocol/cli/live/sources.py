@@ -30,6 +30,7 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings.loading import RadarArrays, load
 from xethru_protocol.recordings.recorded_messages import NO_TIME_NS, RecordingFault
+from xethru_protocol.validation import shown
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.x4 import CARRIER_HZ, real_frame_rate
 
@@ -154,7 +155,13 @@ def _recorded(arguments: Namespace) -> FrameSource:
         area_m=arguments.frame_area,
         downconversion=True if arguments.baseband else None,
     )
-    radar = recording.named(arguments.radar)
+    if arguments.radar is None and len(recording.radars) > 1:
+        names = ", ".join(map(shown, recording.radars))
+        raise CommandFailed(
+            f"{path} holds several radars: {names}; choose one with --radar NAME, or see all of a "
+            "session with 'uwb-slam view'"
+        )
+    radar = recording.radar if arguments.radar is None else recording.named(arguments.radar)
     if not radar.parts:
         raise CommandFailed(f"{path} holds no radar frames")
     frames = max(radar.parts, key=lambda part: part.n_frames)
