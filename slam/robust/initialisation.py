@@ -14,9 +14,9 @@ antenna's position a; a point's is a hyperbola::
     point at b:     r = |b - a|
     wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
 
-Of crossings, what fits a plane wave no worse is no landmark; walls are found by patches
-(:mod:`slam.robust.walls`). A corner of two walls is a point. Source: Leonard and Durrant-Whyte,
-"Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
+A crossing is no landmark unless its ranges fit a hyperbola better, by BIC; walls are found by
+patches (:mod:`slam.robust.walls`). A corner of two walls is a point. Source: Leonard and
+Durrant-Whyte, "Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
 
 A point b with noise n and known dependence D_b on the unknowns of the radars measures
 
@@ -113,7 +113,7 @@ class FittedRanges:
 
     @property
     def is_flat(self) -> bool:
-        """Return whether they are no evidence of a point beside a wall, whose echo is a plane wave.
+        """Return whether they may be a wall's, whose echo is a plane wave.
 
         A curved one must fit better by what BIC asks for one parameter more.
         """
@@ -153,9 +153,9 @@ class _Looks:
         return replace(self, ranges_m=self.ranges_m + radius_m)
 
     def nearest(self, misses_m: Array) -> Indices:
-        """Return where the least of all misses (k,) [m] in each frame of each radar is.
+        """Return the index of the least miss in each frame of each radar, of the finite ones.
 
-        Where a frame has none that is finite, there is no place.
+        ``misses_m`` has shape (k,).
         """
         order = np.argsort(misses_m, kind="stable")
         order = order[: np.count_nonzero(np.isfinite(misses_m))]
