@@ -496,8 +496,7 @@ class RobustBackEnd:
         if has_look or patches:
             self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         of_patches = self._take_patches(patches, added_m)
-        if has_look:
-            self._take_crossings(antennas)
+        of_crossings = self._take_crossings(antennas) if has_look else []
         self._delete_vanished(solve=solve)
         self._n_updates += 1
         if solve:
@@ -509,7 +508,7 @@ class RobustBackEnd:
         if decide:
             self._decide()
         self._log.set_causal(self.state.pose)
-        evidence = (*report.evidence, *evidence_of_misses, *of_patches)
+        evidence = (*report.evidence, *evidence_of_misses, *of_patches, *of_crossings)
         return replace(report, evidence=evidence)
 
     def _check_radars(self, scans: Sequence[RangeScan]) -> None:
@@ -957,12 +956,14 @@ class RobustBackEnd:
             heading_rad = self._log.heading_at(detection.pose)
         return detection.way_to_mirror(heading_rad, self.pose_covariance[2, 2])
 
-    def _take_crossings(self, antennas: Antennas) -> None:
+    def _take_crossings(self, antennas: Antennas) -> list[tuple[int, float]]:
         """Let ranges of nothing known, of radars without images, begin landmarks where they cross.
 
-        Points of patches lie apart from their neighbours, and show walls.
+        Points of patches lie apart from their neighbours, and show walls. Returns of each landmark
+        the id, and how much likelier its ranges are than as false ones.
         """
         pose, fewest = self._log.n_poses - 1, self.parameters.initialisation.min_frames
+        evidence = list[tuple[int, float]]()
         for side, waiting in zip(self._sides, self._crossings, strict=True):
             radars = [radar for radar in side if radar not in self._images.radars]
             pairs = [pair for pair in combinations(radars, 2) if antennas.has_frame[[*pair]].all()]
@@ -980,10 +981,15 @@ class RobustBackEnd:
                 if ranges is None or ranges.n_frames < fewest or ranges.is_flat:
                     continue
                 waiting.remove(tentative)
-                self._place_ranges(ranges)
+                nats = ranges.evidence(self.parameters.ranges)
+                evidence.append((self._place_ranges(ranges), nats))
+        return evidence
 
-    def _place_ranges(self, ranges: FittedRanges) -> None:
-        """Let ranges be those of the landmark that their point certainly is, or of a new one."""
+    def _place_ranges(self, ranges: FittedRanges) -> int:
+        """Let ranges be those of the landmark that their point certainly is, or of a new one.
+
+        Returns its id.
+        """
         state, point = self.state, self._as_uncertain(ranges.point)
         row = match(state, point)
         if row is None:
@@ -992,6 +998,7 @@ class RobustBackEnd:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
         self._use(landmark_id, ranges)
+        return landmark_id
 
     def _as_uncertain(self, point: BodyPoint) -> BodyPoint:
         """Return a point that ranges were fitted to, as uncertain as ranges of the run are."""

@@ -110,6 +110,7 @@ class FittedRanges:
     at: Indices  # where they are among the unassigned ones
     chi_square: float
     chi_square_of_wall: float  # of the same ranges as those of a wall
+    variances: Array  # of the ranges
 
     @property
     def is_flat(self) -> bool:
@@ -122,6 +123,15 @@ class FittedRanges:
     @property
     def n_frames(self) -> int:
         return len(np.unique(self.rows["pose"]))
+
+    def evidence(self, noise: RangeNoise) -> float:
+        """Return the nats of the ranges, if each radar has one range in every frame.
+
+        They are counted as in `slam.robust.association.weigh_known`.
+        """
+        density = max(noise.clutter_per_m, 1.0 / (noise.max_range_m - noise.min_range_m))
+        log_n = -0.5 * (self.chi_square + float(np.sum(np.log(math.tau * self.variances))))
+        return log_n + len(self.rows) * math.log(noise.detection_probability / density)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -163,14 +173,14 @@ class _Looks:
         return np.asarray(order[first])
 
     def share_hit(self, k: Indices, point_m: Array, noise: RangeNoise) -> float:
-        """Return which share of the frames with a point in view some ranges hit."""
+        """Return which share of the frames with a point in view some ranges hit, from the first."""
         away = point_m - self.antennas_m
         distance = np.hypot(away[:, 0], away[:, 1])
         off = np.abs(wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - self.yaws_rad))
         sees = (off <= noise.field_of_view_rad / 2) & (distance >= noise.min_range_m)
         sees &= distance <= noise.max_range_m
-        hit = np.unique(self.rows["frame"][k])
-        return len(hit) / len(np.union1d(hit, self.rows["frame"][sees]))
+        hit, in_view = np.unique(self.rows["frame"][k]), np.unique(self.rows["frame"][sees])
+        return len(hit) / len(np.union1d(hit, in_view[in_view >= hit[0]]))
 
     def chi_square_of_wall(
         self, k: Indices, outward: Array, by_radars: Array, of_radars: Array
@@ -273,7 +283,7 @@ class UnassignedRanges:
         in each frame, of those in the gate. With a radius, what is fitted is the axis behind the
         point: ranges end at the surface. A point that is itself of these ranges is where they are
         looked for at first, and no more. None if they are too few, or hit too few of the frames
-        with the point in view, or do not fit.
+        with the point in view since the first that they hit, or do not fit.
         """
         rule, noise = self._parameters.initialisation, self._parameters.ranges
         at = np.flatnonzero(np.isin(self._rows["radar"], radars))
@@ -326,6 +336,7 @@ class UnassignedRanges:
             rows=looks.rows[k],
             at=at[k],
             chi_square=chi_square,
+            variances=looks.variances[k],
             chi_square_of_wall=looks.chi_square_of_wall(k, outward, J[k, 2:], of_radars),
         )
 

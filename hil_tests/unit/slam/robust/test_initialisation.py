@@ -361,6 +361,32 @@ def test_where_ranges_cross_scan_after_scan_there_is_a_landmark() -> None:
     assert poses.landmarks_m[0] == pytest.approx(target, abs=1e-3)
 
 
+def test_a_new_landmark_is_worth_the_densities_of_its_ranges_over_those_of_false_ones() -> None:
+    """On the spot and with exact ranges: the logarithms of N(0; 0, S) and Pd / lambda of each."""
+    wheels = WheelNoise(scale_sigma=0.05, walk_lever_m=0.5)
+    back_end = RobustBackEnd(paper_rig(), replace(PARAMETERS, wheels=wheels))
+    per_rad_m = RULE.drift_share * wheels.scale_sigma * wheels.walk_lever_m
+    per_m = max(NOISE.clutter_per_m, 1.0 / (NOISE.max_range_m - NOISE.min_range_m))
+    target = np.array([-0.2, 1.0])
+    for k, turn_rad in enumerate(TURNS_RAD):
+        back_end.predict(np.array([0.0, 0.0, TURNS_RAD[1] if k else 0.0]))
+        report = back_end.update(
+            [
+                RangeScan(radar=radar, ranges_m=(range_after(turn_rad, radar, target),))
+                for radar in LEFT
+            ]
+        )
+        if report.evidence:
+            break
+    ((landmark_id, nats),) = report.evidence
+    assert back_end.state.landmark_ids == [landmark_id]
+    since = turn_rad - TURNS_RAD[: k + 1]
+    variances = np.repeat(SIGMA_M**2 + (per_rad_m * since) ** 2, len(LEFT))
+    expected = -0.5 * np.log(2.0 * math.pi * variances)
+    expected += math.log(NOISE.detection_probability / per_m)
+    assert nats == pytest.approx(float(expected.sum()), abs=1e-3)
+
+
 @pytest.mark.parametrize("step_m", [0.0, 0.02])
 def test_ranges_of_a_wall_make_no_landmark(step_m: float) -> None:
     """From where it stands, and on its way, as its echo comes from where the wall is nearest."""
