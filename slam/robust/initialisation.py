@@ -151,12 +151,16 @@ class _Looks:
 
         ``errors`` are those of the point and of the q unknowns of the radars.
         """
-        away = point_m + errors[:2] - self.antennas_m
+        distance, u, off = self.toward(point_m + errors[:2])
+        J = np.hstack([u, self.layout.ranges_by_radars(u, self.headings_rad, self.rows["radar"])])
+        return self.ranges_m - distance - J[:, 2:] @ errors[2:], J, off
+
+    def toward(self, point_m: Array) -> tuple[Array, Array, Array]:
+        """Return distances (k,) [m] and directions (k, 2) to a point, and angles off boresight."""
+        away = point_m - self.antennas_m
         distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_WAY_M)
         u = away / distance[:, None]
-        J = np.hstack([u, self.layout.ranges_by_radars(u, self.headings_rad, self.rows["radar"])])
-        off = np.abs(wrap_angles(np.arctan2(u[:, 1], u[:, 0]) - self.yaws_rad))
-        return self.ranges_m - distance - J[:, 2:] @ errors[2:], J, off
+        return distance, u, np.abs(wrap_angles(np.arctan2(u[:, 1], u[:, 0]) - self.yaws_rad))
 
     def of_axis(self, radius_m: float) -> _Looks:
         """Return them as ranges of the axis of what has a radius."""
@@ -174,9 +178,7 @@ class _Looks:
 
     def share_hit(self, k: Indices, point_m: Array, noise: RangeNoise) -> float:
         """Return which share of the frames with a point in view some ranges hit, from the first."""
-        away = point_m - self.antennas_m
-        distance = np.hypot(away[:, 0], away[:, 1])
-        off = np.abs(wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - self.yaws_rad))
+        distance, _, off = self.toward(point_m)
         sees = (off <= noise.field_of_view_rad / 2) & (distance >= noise.min_range_m)
         sees &= distance <= noise.max_range_m
         hit, in_view = np.unique(self.rows["frame"][k]), np.unique(self.rows["frame"][sees])
@@ -313,7 +315,7 @@ class UnassignedRanges:
         counts = np.unique(looks.rows["radar"][k], return_counts=True)[1]
         if len(counts) < min(len(radars), 2) or counts.min() < rule.min_hits_per_radar:
             return None
-        residual, J, off = looks.at_point(axis_m, errors)
+        residual, J, _ = looks.at_point(axis_m, errors)
         if looks.share_hit(k, axis_m + errors[:2], noise) < rule.min_share:
             return None
         chi_square = float(np.sum(np.square(residual[k]) / looks.variances[k]))
@@ -679,7 +681,7 @@ def crossing(
     """Return the points in view at which two ranges cross, as detections of the first one's radar.
 
     ``ranges`` are given as radar, range and standard deviation [m]; ``pose`` is that of their
-    scans. Source: paper, equations of trilateration.
+    scans. It is what the paper calls trilateration, with the covariance of its linearisation.
     """
     (first, range_m, sigma_m), (second, _, other_sigma_m) = ranges
     radars = np.array([first, second])

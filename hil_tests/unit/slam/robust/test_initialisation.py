@@ -31,6 +31,7 @@ NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), InitialisationRule()
 PARAMETERS = BackEndParameters(ranges=NOISE, initialisation=RULE)
 LEFT = (0, 1)
 STEP_M, N_FRAMES = 0.02, 15
+MOUNTS_M = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
 
 
 def state_of(offset_sigma_m: float = 0.0, mount_sigma_m: float = 0.0) -> State:
@@ -42,7 +43,6 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
     rng = np.random.default_rng(1)
     unassigned = UnassignedRanges(PARAMETERS)
     step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
-    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     for k in range(N_FRAMES):
         unassigned.move(step)
         body = targets - [0.0 if moving else STEP_M * k, 0.0]
@@ -50,7 +50,7 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
             RangeScan(
                 radar=radar,
                 ranges_m=tuple(
-                    float(np.hypot(*(target - mounts[radar])))
+                    float(np.hypot(*(target - MOUNTS_M[radar])))
                     + float(offsets_m[radar])
                     + SIGMA_M * rng.standard_normal()
                     for target in body
@@ -132,10 +132,9 @@ def ranged(ranges_of: Callable[[Array], float]) -> tuple[UnassignedRanges, Array
     parameters = replace(PARAMETERS, wheels=WheelNoise(scale_sigma=0.0))
     unassigned, places, ranges = UnassignedRanges(parameters), list[Array](), list[float]()
     step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
-    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     for k in range(FEW):
         unassigned.move(step)
-        at = np.add(mounts, [STEP_M * k, 0.0])
+        at = np.add(MOUNTS_M, [STEP_M * k, 0.0])
         scans = [RangeScan(radar=radar, ranges_m=(ranges_of(at[radar]),)) for radar in LEFT]
         unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
         places += [at[radar] for radar in LEFT]
@@ -196,13 +195,12 @@ def test_ranges_of_what_is_round_end_at_its_surface() -> None:
 def test_unknown_places_of_antennas_move_the_point_as_they_do() -> None:
     """By differences of points, from ranges that antennas elsewhere took while the robot turned."""
     target, turn_rad, step_m = np.array([0.1, 0.8]), 0.3, 1e-5
-    nominal = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     turned = np.array([[c, -s], [s, c]])
 
     def fitted(error_m: Array) -> BodyPoint:
         """Return the point if the second antenna is mounted so far from its place."""
-        mounts = nominal.copy()
+        mounts = MOUNTS_M.copy()
         mounts[1] += error_m
         unassigned = UnassignedRanges(replace(PARAMETERS, wheels=WheelNoise(scale_sigma=0.0)))
         step = calibrated_motion(np.array([STEP_M, 0.0, 0.0]), np.zeros(3), WheelNoise())
@@ -267,7 +265,7 @@ def test_ranges_from_before_a_turn_are_less_sure_by_the_drift_per_radian() -> No
     point, rows = found.point, found.rows
     assert len(rows) == 2 * len(TURNS_RAD)
     turns_rad = TURNS_RAD[rows["pose"]]
-    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])[rows["radar"]]
+    mounts = MOUNTS_M[rows["radar"]]
     back = turns_rad - TURNS_RAD[-1]
     turned = np.array([[np.cos(back), -np.sin(back)], [np.sin(back), np.cos(back)]])
     away = body - np.einsum("ijk,kj->ki", turned, mounts)
@@ -283,7 +281,6 @@ def test_two_ranges_cross_where_their_target_is(mount_sigma_m: float) -> None:
     """Covariance and derivatives by differences of crossings; one radar was turned meanwhile."""
     target, sigmas = np.array([0.15, 0.9]), (4e-3, 6e-3)
     state = state_of(0.01, mount_sigma_m)
-    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     turn_rad = 0.1
 
     def cross(errors: Array) -> BodyPoint:
@@ -293,7 +290,7 @@ def test_two_ranges_cross_where_their_target_is(mount_sigma_m: float) -> None:
             RangeScan(radar=1, ranges_m=(), moved=(0.0, 0.0, turn_rad)),
         ]
         c, s = math.cos(turn_rad), math.sin(turn_rad)
-        places = [mounts[0], np.array([[c, -s], [s, c]]) @ mounts[1]]
+        places = [MOUNTS_M[0], np.array([[c, -s], [s, c]]) @ MOUNTS_M[1]]
         antennas = antennas_of(paper_rig(), scans, np.zeros(3), mounts_moved(errors[2:]))
         ranges = [
             (radar, float(np.hypot(*(target - places[radar]))) + errors[radar], sigmas[radar])
