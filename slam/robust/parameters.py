@@ -202,6 +202,20 @@ class WallRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RadiusRule:
+    """What is known of the radii of things before they are seen (`slam.robust.solver.radii`)."""
+
+    thin_m: Annotated[float, Origin.CHOSEN] = 1e-3
+    """Scale of the radii of thin things; smaller ones are alike."""
+    most_m: Annotated[float, Origin.CHOSEN] = 0.3
+    """Radii of the others are uniform up to this."""
+    thin_share: Annotated[float, Origin.CHOSEN] = 0.8
+    """How many things are thin."""
+    rounds: Annotated[int, Origin.BUDGET, "rounds"] = 2
+    """Of expectation propagation in one solution."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
     """When the whole run is solved for again, and how."""
 
@@ -227,8 +241,6 @@ class RelinearisationRule:
     """Most steps of one solution."""
     outlier_sigmas: Annotated[float, Origin.QUANTILE] = 4.0
     """Ranges further off than this are left out: of normal errors one in 16000."""
-    radius_scale_m: Annotated[float, Origin.CHOSEN] = 1e-3
-    """Scale of the prior of radii; smaller ones are alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -434,6 +446,7 @@ class BackEndParameters:
     initialisation: InitialisationRule = field(default_factory=InitialisationRule)
     map: MapRule = field(default_factory=MapRule)
     walls: WallRule = field(default_factory=WallRule)
+    radii: RadiusRule = field(default_factory=RadiusRule)
     relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)
     slips: SlipRule = field(default_factory=SlipRule)
     noise: NoiseRule = field(default_factory=NoiseRule)

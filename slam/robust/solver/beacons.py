@@ -180,7 +180,7 @@ def _solved_with(
     """Return the solution of the whole run that begins with a beacon at a place, or None."""
     other = copy.deepcopy(state)
     problem = log.problem(other, parameters, {log_id: _augmented(other, point_m)})
-    smoother = Smoother(problem, parameters.relinearisation)
+    smoother = Smoother(problem, parameters)
     solution = smoother.solve(min(log.starts(other, problem), key=smoother.cost))
     if solution is None:
         return None

@@ -75,7 +75,11 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
 def adopt(
     log: RunLog, state: State, problem: Problem, solution: Solution, parameters: BackEndParameters
 ) -> None:
-    """Replace the belief by a solution, and let it choose the noise of ranges."""
+    """Replace the belief by a solution, and let it choose the noise of ranges.
+
+    The belief is less sure of radii than the solution is (`slam.robust.solver.radii`).
+    """
+    solution = Smoother(problem, parameters).believe(solution)
     _replace(state, problem, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
@@ -90,7 +94,7 @@ def _solved(
     too, and the best solution counts. Where a landmark has corrected the pose at once, the filter's
     path has a jump: its cost is large, although it leads to the better solution.
     """
-    smoother = Smoother(problem, parameters.relinearisation)
+    smoother = Smoother(problem, parameters)
     found: list[Solution] = []
     for start in sorted(log.starts(state, problem), key=smoother.cost):
         solution = smoother.solve(start)
@@ -149,13 +153,13 @@ class _Trial:
 
     def solved_from(self, closed: Estimate, apart_cost: float) -> Solution | None:
         """Return the solution as one from far off, None if the run does not allow it."""
-        rule = self.parameters.relinearisation
-        together = Smoother(self.one, rule).solve(_annealed(self.one, closed, self.parameters))
+        start = _annealed(self.one, closed, self.parameters)
+        together = Smoother(self.one, self.parameters).solve(start)
         if together is None or not self.allows(together, apart_cost):
             return None
         # The search went further than that for the solution with them as two: so does this one.
         doubled = with_doubled(self.two, together.estimate, self.pairs)
-        again = Smoother(self.two, rule).solve(doubled)
+        again = Smoother(self.two, self.parameters).solve(doubled)
         least = apart_cost if again is None else min(apart_cost, again.cost)
         return together if self.allows(together, least) else None
 
@@ -219,7 +223,7 @@ def solved_as_one(
     if not n_mistaken or most_rise <= 0.0:
         return None
     some = trial(rows[is_mistaken], most_rise)
-    again = Smoother(some.two, parameters.relinearisation).solve(apart.estimate)
+    again = Smoother(some.two, parameters).solve(apart.estimate)
     return None if again is None else some.merged(some.solved_from(closed, again.cost))
 
 
@@ -329,7 +333,7 @@ def _annealed(problem: Problem, start: Estimate, parameters: BackEndParameters) 
             range_sigmas_m=factor * problem.range_sigmas_m,
             range_bearing_sigmas_rad=factor * problem.range_bearing_sigmas_rad,
         )
-        solution = Smoother(vague, parameters.relinearisation).solve(start)
+        solution = Smoother(vague, parameters).solve(start)
         if solution is None:
             return start
         fixed = solution.estimate.fixed.copy()
@@ -431,13 +435,12 @@ def solve_whole_run(
     if log.n_poses < 2:
         return None
     problem = log.problem(state, parameters)
-    smoother = Smoother(problem, parameters.relinearisation)
+    smoother = Smoother(problem, parameters)
     found = [smoother.solve(start) for start in log.starts(state, problem)]
     solutions = [solution for solution in found if solution is not None]
     if not solutions:
         return None
-    solution = min(solutions, key=lambda each: each.cost)
-    best = solution.estimate
+    best = min(solutions, key=lambda each: each.cost).estimate
     try:
         of_keys, border = smoother.covariances(best)
     except np.linalg.LinAlgError:

@@ -23,8 +23,8 @@ from scipy.linalg.lapack import dpbtrf, dtbtrs
 
 from slam.geometry import wrap_angles
 from slam.robust import kernels
-from slam.robust.initialisation import is_thick
-from slam.robust.parameters import RelinearisationRule
+from slam.robust.parameters import BackEndParameters
+from slam.robust.solver.radii import RadiusPrior
 from slam.robust.solver.run_log import (
     Estimate,
     Problem,
@@ -455,21 +455,21 @@ class Solution:
 class Smoother:
     """Solves one problem by Gauss-Newton."""
 
-    def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
-        self._problem, self._rule = problem, rule
+    def __init__(self, problem: Problem, parameters: BackEndParameters) -> None:
+        self._problem, self._rule = problem, parameters.relinearisation
         first, layout = problem.keys[:-1], problem.layout
         radii = layout.radii if layout.has_radii else slice(0, 0)
         # Those of a map have its prior.
         self._radii = np.setdiff1d(np.arange(layout.size)[radii], problem.known_at)
-        # Radii and deviations as wavefronts show them; thick things have no other prior
+        # Radii and deviations as wavefronts show them
         self._shown, self._shown_sigmas = np.zeros(layout.size), np.full(layout.size, math.inf)
-        prices = np.ones(layout.size)
         if len(problem.radii_m):
             self._shown[radii] = problem.radii_m
             self._shown_sigmas[radii] = problem.radius_sigmas_m
-            thick = is_thick(problem.radii_m, problem.radius_sigmas_m)
-            prices[radii] = np.where(thick, _TINY, 1.0)
-        self._prices = prices[self._radii]
+        self._of_radii = RadiusPrior(
+            self._shown[self._radii], self._shown_sigmas[self._radii], parameters.radii
+        )
+        self._rounds = parameters.radii.rounds
         chain = chain_of(problem.steps, problem.keys, np.zeros((1, 3)))
         covariances = motion_covariances(chain, problem.step_covariances)
         # W with W C W^T = I, shape (k, 3, 3)
@@ -478,12 +478,15 @@ class Smoother:
         least = _LEAST_WALK_SHARE * np.sqrt(walks.max(axis=0, initial=0.0))
         self._walk_roots = 1.0 / np.sqrt(walks + least**2 + _TINY)
 
-    def solve(self, start: Estimate, tolerance: float = _TOLERANCE) -> Solution | None:
+    def solve(
+        self, start: Estimate, tolerance: float = _TOLERANCE, limit: float = math.inf
+    ) -> Solution | None:
         """Return the solution reached from a start, or None if it failed.
 
-        The search ends when the cost decreases by less than ``tolerance``.
+        The search ends when the cost decreases by less than ``tolerance``. Residuals beyond
+        ``limit`` are left out from the first step on.
         """
-        estimate, limit, rule = start, math.inf, self._rule
+        estimate, rule = start, self._rule
         cost, decrease = self.cost(estimate), math.inf
         for iteration in range(rule.iterations):
             # Far from the solution, what is right may look like an outlier; but the last half of
@@ -515,6 +518,25 @@ class Smoother:
             return None
         return Solution(estimate=estimate, eliminated=left, cost=cost)
 
+    def believe(self, solution: Solution) -> Solution:
+        """Return the solution that knows that radii may be others (`slam.robust.solver.radii`).
+
+        What was found is returned if that fails. From then on the covariances are these, too.
+        """
+        if not len(self._radii):
+            return solution
+        self._of_radii.begin_belief()
+        for left in range(self._rounds, -1, -1):
+            found = self.solve(solution.estimate, limit=self._rule.outlier_sigmas)
+            if found is None:
+                break
+            solution = found
+            if left:
+                radii_m = solution.estimate.fixed[self._radii - HEAD_SIZE]
+                variances = np.asarray(np.linalg.inv(solution.information).diagonal()[self._radii])
+                self._of_radii.improve(radii_m, variances)
+        return solution
+
     def cost(self, estimate: Estimate, limit: float = math.inf) -> float:
         """Return what is to be least: Huber's costs of all measurements, capped at ``limit``.
 
@@ -529,17 +551,12 @@ class Smoother:
         total += float(np.sum(self._walk_residual(estimate) ** 2))
         away, sigmas = self._from_prior(estimate)
         costs = (away / sigmas) ** 2
-        # Of a radius the cost is 2 ln(tau + rho), and quadratic where it is less than tau.
-        tau, price = self._rule.radius_scale_m, self._prices
-        radii = np.maximum(away[self._radii], tau)
-        thin = np.clip(away[self._radii], 0.0, tau)
-        costs[self._radii] = price * thin**2 / (2.0 * tau * tau)
-        costs[self._radii] += price * 2.0 * np.log((tau + radii) / (2.0 * tau))
-        below = np.minimum(away[self._radii], 0.0)
-        away = away[problem.known_at]
-        total += float(away @ problem.known_information @ away)
+        costs[self._radii] = 0.0
+        total += float(np.sum(costs))
+        total += self._of_radii.cost(estimate.fixed[self._radii - HEAD_SIZE])
         total += float(np.sum((self._from_shown(estimate) / self._shown_sigmas) ** 2))
-        return total + float(np.sum(costs) + np.sum((below / tau) ** 2))
+        away = away[problem.known_at]
+        return total + float(away @ problem.known_information @ away)
 
     def constants(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return how far the constants are from their priors' means, (k,), and the priors' sigmas.
@@ -570,19 +587,11 @@ class Smoother:
         return np.asarray(np.diff(estimate.calibration, axis=0) * self._walk_roots)
 
     def _from_prior(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Return how far values are from the prior's mean, and the standard deviations of that.
-
-        Radii have a prior 1 / (tau + rho), or a power of that, which takes most of them for thin,
-        and of those that are not every size for likely: by the quadratic that touches it, as
-        Huber's weights are.
-        """
-        problem, tau = self._problem, self._rule.radius_scale_m
+        """Return how far values are from the prior's mean, and the standard deviations of that."""
+        problem = self._problem
         first = np.concatenate([estimate.poses[0], estimate.calibration[0], estimate.fixed])
         away, sigmas = first - problem.prior_mean, problem.prior_sigmas.copy()
-        radii = away[self._radii]
-        least = np.maximum(radii, tau)
-        rounded = np.sqrt(least * (tau + least) / self._prices)
-        sigmas[self._radii] = np.where(radii < 0.0, tau, rounded)
+        away[self._radii], sigmas[self._radii] = self._of_radii.away(first[self._radii])
         return away, sigmas
 
     def _from_shown(self, estimate: Estimate) -> Array:

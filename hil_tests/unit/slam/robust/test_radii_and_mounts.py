@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 SIGMA_M, STEP_M, RADIUS_SIGMA_M, MOUNT_SIGMA_M = 2e-3, 0.01, 0.03, 5e-3
 DRUM = (0.7, 0.85, 0.1)
+FAR_PILLAR = (0.7, 2.2, 0.12)
 RODS = ((0.1, 0.9, 0.0), (0.4, -0.9, 0.0), (1.0, -0.7, 0.0), (1.25, 1.1, 0.0))
 CLASSROOM = WheelNoise(
     scale_sigma=0.023, turn_scale_sigma=0.023, curvature_sigma_rad_per_m=0.0139,
@@ -38,7 +39,7 @@ CLASSROOM = WheelNoise(
 )  # fmt: skip
 WIDE = RangeNoise(
     sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02,
-    mount_sigma_m=MOUNT_SIGMA_M, radius_sigma_m=RADIUS_SIGMA_M,
+    mount_sigma_m=MOUNT_SIGMA_M, radius_sigma_m=RADIUS_SIGMA_M, max_range_m=3.0,
 )  # fmt: skip
 
 
@@ -67,7 +68,7 @@ def drive(
                 dy = y - mount.y_m - moved[radar, 1]
                 off = math.remainder(math.atan2(dy, dx) - mount.yaw_rad, math.tau)
                 range_m = math.hypot(dx, dy) - radius_m
-                if abs(off) < math.radians(32.5) and range_m < 1.5:
+                if abs(off) < math.radians(32.5) and range_m < WIDE.max_range_m:
                     heard.append(range_m + SIGMA_M * float(rng.standard_normal()))
             scans.append(RangeScan(radar=radar, ranges_m=tuple(heard)))
         back_end.predict(np.array([scale * STEP_M, 0.0, curvature * STEP_M]))
@@ -94,6 +95,20 @@ def test_a_drum_is_mapped_at_its_axis_as_surely_as_it_says() -> None:
     # The prior of the radius is three times too narrow for this drum.
     assert np.mean(squares) < chdtri(3 * 6, 1e-3) / 6 + (DRUM[2] / RADIUS_SIGMA_M) ** 2
     assert np.mean(poses) < chdtri(3 * 6, 1e-3) / 6
+
+
+def test_of_a_far_pillar_the_radius_is_known_to_no_millimetre() -> None:
+    """Wheels that are off by one deviation explain the ranges of a thin one nearly as well."""
+    squares, sigmas = [], []
+    for seed in range(6):
+        back_end, _, _ = drive([FAR_PILLAR], seed, WheelNoise())
+        state = back_end.state
+        (row,) = range(len(state.landmark_ids))
+        (at,) = state.layout.columns(np.array([row]))[2:]
+        sigmas.append(math.sqrt(state.P.block(np.array([at]))[0, 0]))
+        squares.append(((state.radii_m[row] - FAR_PILLAR[2]) / sigmas[-1]) ** 2)
+    assert np.mean(squares) < chdtri(6, 1e-3) / 6
+    assert min(sigmas) > 0.02
 
 
 @pytest.mark.parametrize("mounts_m", [pytest.param(0.0, marks=pytest.mark.rare), MOUNT_SIGMA_M])

@@ -50,7 +50,7 @@ Complex = NDArray[np.complex128]
 
 N_RADARS, N_MARKS, N_STEPS = 4, 3, 12
 ANTENNAS = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
-RULE = RelinearisationRule(iterations=40, outlier_sigmas=50.0)
+RULE = BackEndParameters(relinearisation=RelinearisationRule(iterations=40, outlier_sigmas=50.0))
 
 
 def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Problem, Estimate]:
@@ -350,7 +350,7 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
 def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
     """Of 60 ranges the twelfth is off by 40 standard deviations; by default the limit is four."""
     problem, start = short_run(3, 0.0)
-    rule = RelinearisationRule(iterations=40)
+    rule = BackEndParameters(relinearisation=RelinearisationRule(iterations=40))
     ranges_m = problem.ranges_m.copy()
     ranges_m[11] += 0.2
     spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
@@ -366,7 +366,7 @@ def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
     assert solution.cost == pytest.approx(wanted.cost + 4.0**2, abs=1e-6)
     # However few steps there are, the last ones are without it.
     for iterations in (1, 2, 3):
-        few = replace(rule, iterations=iterations)
+        few = BackEndParameters(relinearisation=RelinearisationRule(iterations=iterations))
         quick = Smoother(replace(problem, ranges_m=ranges_m), few).solve(wanted.estimate)
         assert quick is not None
         assert quick.cost < solution.cost + 1.0
@@ -375,7 +375,9 @@ def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
 def test_far_from_the_solution_no_range_is_left_out() -> None:
     """Landmarks start 0.3 m off, so that all their ranges lie beyond the limit."""
     problem, start = short_run(3, 0.0)
-    smoother = Smoother(problem, RelinearisationRule(iterations=40))
+    smoother = Smoother(
+        problem, BackEndParameters(relinearisation=RelinearisationRule(iterations=40))
+    )
     near = smoother.solve(start, tolerance=1e-14)
     away = start.fixed.copy()
     marks = slice(problem.layout.landmarks.start - 6, problem.layout.landmarks.stop - 6)
@@ -390,7 +392,9 @@ def test_far_from_the_solution_no_range_is_left_out() -> None:
 @pytest.mark.parametrize("segment", [0, 2, 4])
 def test_a_motion_of_more_noise_takes_up_what_the_wheels_report_wrongly(segment: int) -> None:
     problem, start = short_run(5, 0.0)
-    rule = RelinearisationRule(iterations=40, outlier_sigmas=math.inf)
+    rule = BackEndParameters(
+        relinearisation=RelinearisationRule(iterations=40, outlier_sigmas=math.inf)
+    )
     # Known wheels: over so short a way their errors would do what a slip does.
     sigmas = problem.prior_sigmas.copy()
     sigmas[3:6] = 1e-3

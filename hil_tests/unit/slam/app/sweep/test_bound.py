@@ -153,7 +153,9 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         range_bearings_rad=np.full(len(used), np.nan),
         range_bearing_sigmas_rad=np.full(len(used), np.nan),
     )
-    rule = RelinearisationRule(iterations=20, outlier_sigmas=math.inf)
+    rule = BackEndParameters(
+        relinearisation=RelinearisationRule(iterations=20, outlier_sigmas=math.inf)
+    )
     begin = Estimate(
         poses=np.vstack([np.zeros(3), bound.filtered]),
         calibration=np.zeros((1, 3)),
