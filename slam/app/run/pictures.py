@@ -106,14 +106,16 @@ def svg_of(
 def _make_ready(figure: Figure) -> None:
     """Write out control characters in names from a file, and lay the axes out.
 
-    No font has those characters. Axes of equal scale get their last tick labels when they have been
-    laid out once, for which `savefig`, which does it again, leaves room.
+    No font has those characters. A layout changes the limits of axes of equal scale, and so their
+    tick labels, which take more or less room: the second one allows for that, and `savefig` does
+    the last.
     """
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         if not text.get_text().isprintable():
             text.set_text(each_line(text.get_text()))
-    figure.draw_without_rendering()
+    for _ in range(2):
+        figure.draw_without_rendering()
 
 
 def label(
