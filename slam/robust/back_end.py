@@ -766,6 +766,7 @@ class RobustBackEnd:
 
     def _take_shown(self, radar: int, shown: set[int], hidden: set[int]) -> None:
         """Take the ids that a patch shows and hides; leave out the single ranges of the latter."""
+        self._existence.take_patch(shown, hidden)
         since = self._images.take_patch(radar, shown, hidden, self._log.n_poses)
         if hidden:
             self._log.leave_out(radar, hidden, since)

@@ -9,7 +9,7 @@ whole run decides (`slam.robust.solver.revision.solved_as_one`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +43,8 @@ class _Record:
     score: float = 0.0
     hits: int = 0
     n_heard: int = 0  # ranges of it
+    # By how many more patches it was shown than had it in view and did not show it
+    more_shown: int = 0
     n_unheard: int = 0  # how often a radar had it surely in view and did not hear it
     # Where its mirror image lies, while that may be what is there. A point on the way is its own,
     # and known no better than both sides of the way allow.
@@ -86,6 +88,12 @@ class Existence:
     def heard(self, landmark_id: int) -> None:
         self._records[landmark_id].n_heard += 1
 
+    def take_patch(self, shown: Iterable[int], hidden: Iterable[int]) -> None:
+        """Count what a patch shows, and what it has in view and does not show."""
+        for ids, count in ((shown, 1), (hidden, -1)):
+            for id_ in ids:
+                self._records[id_].more_shown += count
+
     def unheard(self, landmark_id: int) -> float:
         """Count that a radar did not hear a landmark; return the evidence of that, in nats.
 
@@ -114,8 +122,14 @@ class Existence:
         self._records[landmark_id] = _Record(score=float(self._report_hits), hits=hits)
 
     def is_reported(self, landmark_id: int) -> bool:
+        """Return whether a landmark is certain enough.
+
+        From far, patches take two things that stand close together for one between them. No single
+        range is of that one, and patches from near do not show it.
+        """
         record = self._records[landmark_id]
-        return record.hits >= self._report_hits and record.mirrored is None
+        is_there = record.n_heard > 0 or record.more_shown >= 0
+        return record.hits >= self._report_hits and record.mirrored is None and is_there
 
     def forget(self, landmark_id: int) -> None:
         self._records.pop(landmark_id, None)
@@ -126,6 +140,7 @@ class Existence:
         into.hits += other.hits
         self.take_mirror(kept, other.mirrored)
         into.n_heard += other.n_heard
+        into.more_shown += other.more_shown
         into.n_unheard += other.n_unheard
         self.forget(gone)
 

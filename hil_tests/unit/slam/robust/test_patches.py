@@ -532,6 +532,20 @@ def test_two_landmarks_that_are_one_may_be_a_mirror_image_if_they_have_one_way(
     assert existence.is_reported(0) == is_reported
 
 
+def test_what_most_patches_hide_and_no_radar_hears_is_not_reported() -> None:
+    """From far two rods are one between them; of two that are one, either may have been heard."""
+    existence = Existence(MapRule(), 1, 0.9)
+    for id_ in (0, 1, 2):
+        existence.hit(id_, 5)
+    for shown, hidden in (({0, 1}, set()), ({0}, {1}), (set(), {0, 1}), (set(), {2})):
+        existence.take_patch(shown, hidden)
+    assert [existence.is_reported(id_) for id_ in (0, 1, 2)] == [True, False, False]
+    existence.heard(1)
+    assert existence.is_reported(1)
+    existence.merge(2, 1)
+    assert existence.is_reported(2)
+
+
 def test_on_which_side_it_is_a_turn_that_did_not_happen_does_not_show() -> None:
     """The wheels slip; the filter has the pose from elsewhere."""
     back_end, _ = driven(*[(ALONG, True)] * 4)
