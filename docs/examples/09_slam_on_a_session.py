@@ -12,13 +12,13 @@ session of your own: `python 09_slam_on_a_session.py out/run/session.mcap`. It p
 ```text
 wrote drive/session.mcap
 274 poses in 55 s
-error of the path: wheels 10 mm, SLAM 2 mm
-landmark at +0.72, +1.62, standard deviation 6 mm
+error of the path: wheels 10 mm, SLAM 1 mm
+landmark at +0.72, +1.61, standard deviation 5 mm
+landmark at -0.63, +1.63, standard deviation 6 mm
 landmark at -0.23, -0.96, standard deviation 5 mm
-landmark at +1.24, -0.60, standard deviation 5 mm
-landmark at -0.90, +0.29, standard deviation 5 mm
-landmark at +1.73, +0.63, standard deviation 6 mm
-landmark at -0.64, +1.63, standard deviation 8 mm
+landmark at +1.24, -0.60, standard deviation 4 mm
+landmark at -0.90, +0.29, standard deviation 4 mm
+landmark at +1.73, +0.63, standard deviation 5 mm
 ```
 """
 

@@ -9,8 +9,8 @@ The error is that of the path (RMS, aligned to the truth); that of the wheels al
 prints
 
 ```text
-of the preset: error 2 mm, 6 landmarks for 6 rods
-own: error 3 mm, 5 landmarks for 6 rods
+of the preset: error 1 mm, 6 landmarks for 6 rods
+own: error 4 mm, 4 landmarks for 6 rods
 ```
 """
 

@@ -12,7 +12,7 @@ Without an argument the cluster is two processes of this machine; for a real one
 short_drive, preset robust, 2 runs (simulated): SLAM ATE median ...
 wrote sweep.json
 seed 0: wheels 11 mm, SLAM 3 mm
-seed 1: wheels 11 mm, SLAM 4 mm
+seed 1: wheels 11 mm, SLAM 3 mm
 ```
 """
 

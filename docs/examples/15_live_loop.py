@@ -7,8 +7,8 @@ is `open_rig("robot.toml")`, times are those of `time.monotonic_ns`, and the pos
 given by `slam.add_odometry(stamp_ns, pose)` before `slam.step(scan.t_ns, frames=scan)`. It prints
 
 ```text
-10 s: at +0.80, +0.51 m, 5 landmarks
-20 s: at -0.01, +0.80 m, 5 landmarks
+10 s: at +0.80, +0.50 m, 6 landmarks
+20 s: at -0.01, +0.80 m, 6 landmarks
 30 s: at -0.00, +0.19 m, 6 landmarks
 40 s: at +0.65, +0.80 m, 6 landmarks
 50 s: at +0.70, +0.00 m, 6 landmarks

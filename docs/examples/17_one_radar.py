@@ -6,11 +6,13 @@ right on two laps of a square, one in each direction, which end where they began
 the six rods; its path is little better than that of the wheels. It prints
 
 ```text
-where it began: wheels 12 mm off, SLAM 9 mm
-landmark at +1.74, +0.64
-landmark at +0.71, +1.63
-landmark at -0.91, +0.28
-landmark at +1.25, -0.58
+where it began: wheels 12 mm off, SLAM 6 mm
+landmark at +1.73, +0.64
+landmark at +0.71, +1.61
+landmark at -0.90, +0.29
+landmark at -0.23, -0.96
+landmark at +1.24, -0.59
+landmark at -0.64, +1.62
 ```
 """
 
