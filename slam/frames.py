@@ -105,6 +105,9 @@ class Detector(Protocol):
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         """Return the echoes of one frame inside the range limits, nearest first.
 
+        The limits are those of `DetectionConfig`: what SLAM expects there and is not given counts
+        as missed.
+
         ``range_offset_m`` is what this module measures too long (``Mount.range_offset_m``).
         """
         ...

@@ -10,7 +10,7 @@ prints
 
 ```text
 of the preset: error 1 mm, 6 landmarks for 6 rods
-own: error 4 mm, 4 landmarks for 6 rods
+own: error 3 mm, 7 landmarks for 6 rods
 ```
 """
 
@@ -27,7 +27,13 @@ from slam.live import open_session
 
 
 class EnvelopePeaks:
-    """Peaks of the envelope that are eight times as high as its median."""
+    """Peaks of the envelope that are eight times as high as its median.
+
+    SLAM expects to hear what is in view between the two ranges of the preset.
+    """
+
+    def __init__(self, nearest_m: float, farthest_m: float) -> None:
+        self._nearest_m, self._farthest_m = nearest_m, farthest_m
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         envelope = np.abs(hilbert(frame.samples))
@@ -41,7 +47,7 @@ class EnvelopePeaks:
                 amplitude=float(envelope[peak]),
             )
             for peak, range_m in zip(peaks, ranges_m, strict=True)
-            if 0.2 <= range_m <= 1.5
+            if self._nearest_m <= range_m <= self._farthest_m
         )
 
     def detect_many(
@@ -52,7 +58,9 @@ class EnvelopePeaks:
 
 def main(path: str) -> None:
     session = open_session(path)
-    for name, front_end in (("of the preset", None), ("own", EnvelopePeaks())):
+    limits = session.config.detection
+    own = EnvelopePeaks(limits.min_range_m, limits.max_range_m)
+    for name, front_end in (("of the preset", None), ("own", own)):
         slam = Slam(session.rig, session.config, wheels=session.wheels, front_end=front_end)
         places_m, truth_m = [], []
         for scan in session:
