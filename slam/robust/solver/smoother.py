@@ -487,7 +487,7 @@ class Smoother:
         ``limit`` are left out from the first step on.
         """
         estimate, rule = start, self._rule
-        cost, decrease = self.cost(estimate), math.inf
+        cost, decrease = self.cost(estimate, limit), math.inf
         for iteration in range(rule.iterations):
             # Far from the solution, what is right may look like an outlier; but the last half of
             # the steps is without outliers.
@@ -519,7 +519,7 @@ class Smoother:
         return Solution(estimate=estimate, eliminated=left, cost=cost)
 
     def believe(self, solution: Solution) -> Solution:
-        """Return the solution that knows that radii may be others (`slam.robust.solver.radii`).
+        """Return a solution as unsure of radii as their prior is (`slam.robust.solver.radii`).
 
         What was found is returned if that fails. From then on the covariances are these, too.
         """
