@@ -766,7 +766,8 @@ class RobustBackEnd:
 
     def _take_shown(self, radar: int, shown: set[int], hidden: set[int]) -> None:
         """Take the ids that a patch shows and hides; leave out the single ranges of the latter."""
-        self._existence.take_patch(shown, hidden)
+        self._existence.show(shown)
+        self._existence.show(hidden, -1)
         since = self._images.take_patch(radar, shown, hidden, self._log.n_poses)
         if hidden:
             self._log.leave_out(radar, hidden, since)
@@ -939,6 +940,7 @@ class RobustBackEnd:
             update_with_point(state, row, point)
         rule = self.parameters.bearings(of_patches=tentative.is_of_patches)
         self._existence.hit(landmark_id, len(tentative.seen) * rule.frames_per_scan)
+        self._existence.show([landmark_id], len(tentative.seen))
         ways = [self._way_to_mirror(detection) for detection in tentative.seen]
         if row is None:
             self._existence.begin_mirrored(landmark_id, ways)
@@ -1010,6 +1012,7 @@ class RobustBackEnd:
         """Count and log ranges that were of nothing known as those of a landmark."""
         self._unassigned.use_up(ranges)
         self._existence.hit(landmark_id, ranges.n_frames)
+        self._existence.show([landmark_id], ranges.n_frames)
         self._log.add_unassigned(landmark_id, ranges.rows)
 
     def _delete_vanished(self, *, solve: bool) -> None:

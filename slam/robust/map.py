@@ -43,7 +43,7 @@ class _Record:
     score: float = 0.0
     hits: int = 0
     n_heard: int = 0  # ranges of it
-    # By how many more patches it was shown than had it in view and did not show it
+    # Patches that showed it, and frames that began it, less patches that had it in view and did not
     more_shown: int = 0
     n_unheard: int = 0  # how often a radar had it surely in view and did not hear it
     # Where its mirror image lies, while that may be what is there. A point on the way is its own,
@@ -88,11 +88,10 @@ class Existence:
     def heard(self, landmark_id: int) -> None:
         self._records[landmark_id].n_heard += 1
 
-    def take_patch(self, shown: Iterable[int], hidden: Iterable[int]) -> None:
-        """Count what a patch shows, and what it has in view and does not show."""
-        for ids, count in ((shown, 1), (hidden, -1)):
-            for id_ in ids:
-                self._records[id_].more_shown += count
+    def show(self, ids: Iterable[int], times: int = 1) -> None:
+        """Count how often landmarks were shown; less than 0: how often not, though in view."""
+        for id_ in ids:
+            self._records[id_].more_shown += times
 
     def unheard(self, landmark_id: int) -> float:
         """Count that a radar did not hear a landmark; return the evidence of that, in nats.
@@ -119,7 +118,8 @@ class Existence:
 
     def know(self, landmark_id: int, hits: int) -> None:
         """Begin with what frames of an earlier run hit: its score is that of a new landmark."""
-        self._records[landmark_id] = _Record(score=float(self._report_hits), hits=hits)
+        score = float(self._report_hits)
+        self._records[landmark_id] = _Record(score=score, hits=hits, more_shown=hits)
 
     def is_reported(self, landmark_id: int) -> bool:
         """Return whether a landmark is certain enough.

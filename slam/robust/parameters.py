@@ -206,11 +206,11 @@ class RadiusRule:
     """What is known of the radii of things before they are seen (`slam.robust.solver.radii`)."""
 
     thin_m: Annotated[float, Origin.CHOSEN] = 1e-3
-    """Scale of the radii of thin things; smaller ones are alike."""
-    most_m: Annotated[float, Origin.CHOSEN] = 0.3
-    """Radii of the others are uniform up to this."""
+    """Standard deviation of the radii of thin things; in a search smaller ones cost the same."""
+    thick_m: Annotated[float, Origin.CHOSEN] = 0.2
+    """Scale of the half-normal density of the radii of the others."""
     thin_share: Annotated[float, Origin.CHOSEN] = 0.8
-    """How many things are thin."""
+    """Share of things that are thin."""
     rounds: Annotated[int, Origin.BUDGET, "rounds"] = 2
     """Of expectation propagation in one solution."""
 

@@ -48,7 +48,7 @@ _FRONT_END = override(
     SlamConfig(),
     {
         "detection.front_end": FrontEnd.JOINT.value,
-        # the leakage of the antennas ends before, and rods are followed farther than SLAM maps
+        # The antennas' leakage ends before; rods are followed farther than preset `paper` maps.
         "detection.min_range_m": 0.3,
         "detection.max_range_m": 2.5,
     },

@@ -6,10 +6,10 @@ of them for thin, and of those that are not every size for likely.
 Ranges may hardly tell a thin thing from a thick one. The belief has two modes then, and a search
 ends in one of them: a pillar is thin to a millimetre, and the wheels are what errs. So the belief
 has another prior, a mixture: normal about zero with a small scale for a share of all things, and
-uniform for the others. Expectation propagation replaces the prior of each radius by a normal
-density, its site, such that the belief has the moments that it has with the prior itself. They are
-taken about the likelier mode, not about the mean, which is of neither kind of things: what is thin
-stays where it is, and is less sure.
+half-normal with a large scale for the others. Expectation propagation replaces the prior of each
+radius by a normal density, its site, such that the belief has the moments that it has with the
+prior itself. They are taken about the likelier mode, not about the mean, which is of neither kind
+of things: what is thin stays where it is, and is less sure.
 
 Source: Minka, Expectation propagation for approximate Bayesian inference, UAI 2001.
 """
@@ -40,7 +40,7 @@ class _Sites:
     @classmethod
     def prior(cls, n: int, rule: RadiusRule) -> _Sites:
         """Return those of ``n`` radii of which nothing is known."""
-        sigma_m = math.sqrt((1.0 - rule.thin_share) / 3.0) * rule.most_m
+        sigma_m = math.sqrt(1.0 - rule.thin_share) * rule.thick_m
         return cls(means_m=np.zeros(n), sigmas_m=np.full(n, sigma_m))
 
     def improved(self, radii_m: Array, variances_m2: Array, rule: RadiusRule) -> _Sites:
@@ -48,23 +48,29 @@ class _Sites:
 
         ``radii_m`` and ``variances_m2`` (k,) are what is believed with these sites.
         """
-        least = rule.most_m**-2.0
+        least = rule.thick_m**-2.0
         # What all else says of each radius
         precisions = np.maximum(1.0 / variances_m2 - self.sigmas_m**-2.0, _LEAST_SHARE * least)
         means = (radii_m / variances_m2 - self.means_m * self.sigmas_m**-2.0) / precisions
-        both = 1.0 / precisions + rule.thin_m**2
-        log_thin = -(means**2 / both + np.log(math.tau * both)) / 2.0
-        thin_variances = 1.0 / (precisions + rule.thin_m**-2.0)
-        thin_means = thin_variances * precisions * means
-        log_thick, thick_means, thick_variances = _above_zero(means, 1.0 / precisions)
-        log_odds = math.log(rule.thin_share * rule.most_m / (1.0 - rule.thin_share))
-        share = expit(log_odds + log_thin - log_thick)
+        log_thin, thin_means, thin_variances = _product(means, precisions, rule.thin_m)
+        log_both, normal_means, normal_variances = _product(means, precisions, rule.thick_m)
+        log_mass, thick_means, thick_variances = _above_zero(normal_means, normal_variances)
+        log_odds = math.log(rule.thin_share / (1.0 - rule.thin_share))
+        share = expit(log_odds + log_thin - (math.log(2.0) + log_both + log_mass))
         middles = np.where(share > 0.5, thin_means, thick_means)
         second = share * (thin_variances + (thin_means - middles) ** 2)
         second += (1.0 - share) * (thick_variances + (thick_means - middles) ** 2)
         of_sites = np.maximum(1.0 / second - precisions, least)
         site_means = (middles * (precisions + of_sites) - precisions * means) / of_sites
         return _Sites(means_m=site_means, sigmas_m=of_sites**-0.5)
+
+
+def _product(means: Array, precisions: Array, scale_m: float) -> tuple[Array, Array, Array]:
+    """Return log evidence, mean and variance of normal densities times one about zero, (k,)."""
+    both = 1.0 / precisions + scale_m**2
+    variances = 1.0 / (precisions + scale_m**-2.0)
+    log_evidence = -(means**2 / both + np.log(math.tau * both)) / 2.0
+    return log_evidence, variances * precisions * means, variances
 
 
 class RadiusPrior:

@@ -79,7 +79,9 @@ def adopt(
 
     The belief is less sure of radii than the solution is (`slam.robust.solver.radii`).
     """
-    solution = Smoother(problem, parameters).believe(solution)
+    believed = Smoother(problem, parameters).believe(solution)
+    # That left out other outliers: a landmark may have no range left.
+    solution = believed if is_determined(believed.information) else solution
     _replace(state, problem, solution)
     log.solved(problem, solution.estimate)
     learn_noise(problem, solution.estimate, state, parameters)
@@ -430,7 +432,8 @@ def solve_whole_run(
 ) -> tuple[Array, Array, Array, Array, Array] | None:
     """Return poses (n + 1, 3) and covariances, features (m, 2) and covariances, and constants.
 
-    None if it fails. Errors are additive; of the constants see `SmoothedRun`. Nothing is changed.
+    None if it fails. Radii are the likeliest, and covariances those of the search for them. Errors
+    are additive; of the constants see `SmoothedRun`. Nothing is changed.
     """
     if log.n_poses < 2:
         return None

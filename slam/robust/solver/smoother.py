@@ -521,7 +521,7 @@ class Smoother:
     def believe(self, solution: Solution) -> Solution:
         """Return a solution as unsure of radii as their prior is (`slam.robust.solver.radii`).
 
-        What was found is returned if that fails. From then on the covariances are these, too.
+        What was found is returned if that fails.
         """
         if not len(self._radii):
             return solution

@@ -538,12 +538,16 @@ def test_what_most_patches_hide_and_no_radar_hears_is_not_reported() -> None:
     for id_ in (0, 1, 2):
         existence.hit(id_, 5)
     for shown, hidden in (({0, 1}, set()), ({0}, {1}), (set(), {0, 1}), (set(), {2})):
-        existence.take_patch(shown, hidden)
+        existence.show(shown)
+        existence.show(hidden, -1)
     assert [existence.is_reported(id_) for id_ in (0, 1, 2)] == [True, False, False]
     existence.heard(1)
     assert existence.is_reported(1)
     existence.merge(2, 1)
     assert existence.is_reported(2)
+    existence.know(3, 50)  # of a saved map
+    existence.show([3], -1)
+    assert existence.is_reported(3)
 
 
 def test_on_which_side_it_is_a_turn_that_did_not_happen_does_not_show() -> None:
