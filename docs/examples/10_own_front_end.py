@@ -10,7 +10,7 @@ prints
 
 ```text
 of the preset: error 1 mm, 6 landmarks for 6 rods
-own: error 3 mm, 7 landmarks for 6 rods
+own: error 2 mm, 6 landmarks for 6 rods
 ```
 """
 
