@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.integrate import quad
+from scipy.integrate import simpson
 
 from slam.robust.parameters import RadiusRule
 from slam.robust.solver.radii import RadiusPrior
@@ -24,34 +24,31 @@ def moments(mean_m: float, sigma_m: float) -> tuple[float, float]:
     All else says that the radius is ``mean_m`` with the standard deviation ``sigma_m``.
     """
 
-    def other(rho: float) -> float:
-        return math.exp(-(((rho - mean_m) / sigma_m) ** 2 - least) / 2.0)
+    def other(rho: Array) -> Array:
+        return np.exp(-(((rho - mean_m) / sigma_m) ** 2 - least) / 2.0)
 
-    def thin(rho: float) -> float:
-        away = rho / RULE.thin_m
-        normal = math.exp(-(away**2) / 2.0) / math.sqrt(math.tau) / RULE.thin_m
-        return RULE.thin_share * normal * other(rho)
+    def normal(rho: Array, scale_m: float) -> Array:
+        return np.exp(-((rho / scale_m) ** 2) / 2.0) / (math.sqrt(math.tau) * scale_m)
 
-    def thick(rho: float) -> float:
-        normal = math.exp(-((rho / RULE.thick_m) ** 2) / 2.0) / math.sqrt(math.tau)
-        return (1.0 - RULE.thin_share) * 2.0 * normal / RULE.thick_m * other(rho)
+    def thin(rho: Array) -> Array:
+        return RULE.thin_share * normal(rho, RULE.thin_m) * other(rho)
+
+    def thick(rho: Array) -> Array:
+        return (1.0 - RULE.thin_share) * 2.0 * normal(rho, RULE.thick_m) * other(rho)
 
     least = (min(mean_m, 0.0) / sigma_m) ** 2  # keeps the densities from vanishing
     ends = (mean_m - 9.0 * sigma_m, mean_m + 9.0 * sigma_m)
-    spans: dict[Callable[[float], float], tuple[float, float]] = {
+    spans: dict[Callable[[Array], Array], tuple[float, float]] = {
         thin: (max(ends[0], -9.0 * RULE.thin_m), min(ends[1], 9.0 * RULE.thin_m)),
         thick: (max(ends[0], 0.0), min(ends[1], 9.0 * RULE.thick_m)),
     }
 
-    def total(density: Callable[[float], float], power: int, about: float = 0.0) -> float:
+    def total(density: Callable[[Array], Array], power: int, about: float = 0.0) -> float:
         low, high = spans[density]
         if high <= low:
             return 0.0
-        inner = [each for each in (0.0, mean_m) if low < each < high]
-        found = quad(
-            lambda rho: density(rho) * (rho - about) ** power, low, high, points=inner, limit=200
-        )
-        return float(found[0])
+        rho = np.linspace(low, high, 20_001)
+        return float(simpson(density(rho) * (rho - about) ** power, x=rho))
 
     masses = {density: total(density, 0) for density in spans}
     assume(abs(masses[thin] - masses[thick]) > 1e-3 * sum(masses.values()))
