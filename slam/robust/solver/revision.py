@@ -80,7 +80,7 @@ def adopt(
     The belief is less sure of radii than the solution is (`slam.robust.solver.radii`).
     """
     believed = Smoother(problem, parameters).believe(solution)
-    # That left out other outliers: a landmark may have no range left.
+    # Other ranges may be outliers in it, and a landmark may have none left.
     solution = believed if is_determined(believed.information) else solution
     _replace(state, problem, solution)
     log.solved(problem, solution.estimate)

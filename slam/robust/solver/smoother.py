@@ -519,7 +519,7 @@ class Smoother:
         return Solution(estimate=estimate, eliminated=left, cost=cost)
 
     def believe(self, solution: Solution) -> Solution:
-        """Return a solution as unsure of radii as their prior is (`slam.robust.solver.radii`).
+        """Return a solution with the uncertainty of radii (`slam.robust.solver.radii`).
 
         What was found is returned if that fails.
         """

@@ -50,7 +50,9 @@ Complex = NDArray[np.complex128]
 
 N_RADARS, N_MARKS, N_STEPS = 4, 3, 12
 ANTENNAS = np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]])
-RULE = BackEndParameters(relinearisation=RelinearisationRule(iterations=40, outlier_sigmas=50.0))
+PARAMETERS = BackEndParameters(
+    relinearisation=RelinearisationRule(iterations=40, outlier_sigmas=50.0)
+)
 
 
 def short_run(seed: int, walk: float, *, has_radii: bool = True) -> tuple[Problem, Estimate]:
@@ -293,7 +295,7 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(
             radii_m=np.array([0.08, 0.01, 0.0]),
             radius_sigmas_m=np.array([0.01, 0.02, math.inf]),
         )
-    smoother = Smoother(problem, RULE)
+    smoother = Smoother(problem, PARAMETERS)
     solution = smoother.solve(start, tolerance=1e-14)
     assert solution is not None
     n_cal, whitenings = len(start.calibration), motion_whitenings(problem)
@@ -331,7 +333,7 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
     ranges_m = problem.ranges_m.copy()
     ranges_m[[4, 17, 33]] += [0.03, -0.04, 0.05]
     problem = replace(problem, ranges_m=ranges_m, huber_sigmas=2.0)
-    solution = Smoother(problem, RULE).solve(start, tolerance=1e-13)
+    solution = Smoother(problem, PARAMETERS).solve(start, tolerance=1e-13)
     assert solution is not None
     n_rows, whitenings = len(ranges_m) + len(problem.with_bearing), motion_whitenings(problem)
 
@@ -350,13 +352,13 @@ def test_huber_weights_are_those_of_the_solution_itself() -> None:
 def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
     """Of 60 ranges the twelfth is off by 40 standard deviations; by default the limit is four."""
     problem, start = short_run(3, 0.0)
-    rule = BackEndParameters(relinearisation=RelinearisationRule(iterations=40))
+    parameters = BackEndParameters(relinearisation=RelinearisationRule(iterations=40))
     ranges_m = problem.ranges_m.copy()
     ranges_m[11] += 0.2
-    spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
+    spoilt = Smoother(replace(problem, ranges_m=ranges_m), parameters)
     names = [name for name in Problem.__dataclass_fields__ if name.startswith("range")]
     rows = {name: np.delete(getattr(problem, name), 11, axis=0) for name in names}
-    without = Smoother(replace(problem, **rows), rule)
+    without = Smoother(replace(problem, **rows), parameters)
     wanted = without.solve(start, tolerance=1e-14)
     assert wanted is not None
     solution = spoilt.solve(wanted.estimate, tolerance=1e-14)
@@ -392,7 +394,7 @@ def test_far_from_the_solution_no_range_is_left_out() -> None:
 @pytest.mark.parametrize("segment", [0, 2, 4])
 def test_a_motion_of_more_noise_takes_up_what_the_wheels_report_wrongly(segment: int) -> None:
     problem, start = short_run(5, 0.0)
-    rule = BackEndParameters(
+    parameters = BackEndParameters(
         relinearisation=RelinearisationRule(iterations=40, outlier_sigmas=math.inf)
     )
     # Known wheels: over so short a way their errors would do what a slip does.
@@ -411,7 +413,7 @@ def test_a_motion_of_more_noise_takes_up_what_the_wheels_report_wrongly(segment:
     slipped = replace(sure, steps=steps)
     told = replace(slipped, step_covariances=covariances)
     right, wrong, loose = (
-        Smoother(each, rule).solve(start, tolerance=1e-13) for each in (sure, slipped, told)
+        Smoother(each, parameters).solve(start, tolerance=1e-13) for each in (sure, slipped, told)
     )
     assert right is not None
     assert wrong is not None

@@ -153,7 +153,7 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         range_bearings_rad=np.full(len(used), np.nan),
         range_bearing_sigmas_rad=np.full(len(used), np.nan),
     )
-    rule = BackEndParameters(
+    parameters = BackEndParameters(
         relinearisation=RelinearisationRule(iterations=20, outlier_sigmas=math.inf)
     )
     begin = Estimate(
@@ -161,7 +161,7 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
         calibration=np.zeros((1, 3)),
         fixed=np.concatenate([np.zeros(4), bound.landmarks_m.ravel() + 0.01]),
     )
-    solution = Smoother(problem, rule).solve(begin, tolerance=1e-12)
+    solution = Smoother(problem, parameters).solve(begin, tolerance=1e-12)
     assert solution is not None
     return solution
 
